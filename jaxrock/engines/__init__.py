@@ -1,4 +1,4 @@
-"""How one scene is followed: what any engine does (flow, guards, reset, rest, the free stage), and two engines.
+"""Engines that follow one scene: the shared physics (flow, guards, reset, rest, the free stage), and two integrators.
 
 Imports `models`, `motions`, `blocks`, `transforms`, `numerics`. Start with `stepper`, then `taylor.careful`.
 """

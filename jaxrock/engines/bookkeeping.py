@@ -1,4 +1,4 @@
-"""What is kept of a response on its way: peaks, the distance from overturning, errors, and whether all is well."""
+"""Records of a response in progress: peaks, the distance from overturning, errors, and the status."""
 
 from dataclasses import replace
 
@@ -17,11 +17,11 @@ from jaxrock.status import Status
 Scalar = Inexact[Array, ""]
 Flag = Bool[Array, ""]
 
-MOST_OFF = 1e-2  # standard error over the saddle's angle beyond which a state means nothing
+MOST_OFF = 1e-2  # standard error over the saddle's angle beyond which a state is meaningless
 
 
 def checked(stepper: AbstractStepper, before: State, after: State) -> State:
-    """Count the step; stop where the state is not finite, and tell where its error has outgrown it."""
+    """Count the step. Stop where the state is not finite, and set the status where its error is too large."""
     good = jnp.isfinite(after.opening) & jnp.isfinite(after.velocity) & jnp.isfinite(after.local)
     lost = (after.side != 0) & ~(after.spread.square <= (MOST_OFF * stepper.scene.moments.saddle) ** 2)
     if not stepper.history:
@@ -38,9 +38,9 @@ def checked(stepper: AbstractStepper, before: State, after: State) -> State:
 
 
 def escaped(stepper: AbstractStepper, state: State, angle: Angle) -> Flag:
-    """Whether no forcing still to come can bring it back.
+    """Return whether no forcing still to come can bring the block back.
 
-    The most helpful forcing is the bound of all that is to come, for good: the block is lost if it is past the
+    The most helpful forcing is the bound of the forcing to come, applied for ever. The block is lost if it is past the
     stable manifold even then, and if nothing holds it here or further on.
     """
     moments = stepper.scene.moments
@@ -55,8 +55,11 @@ def escaped(stepper: AbstractStepper, state: State, angle: Angle) -> Flag:
 def errors_after(
     stepper: AbstractStepper, state: State, angle: Angle, ground: tuple, elapsed: Scalar, step: tuple
 ) -> Spread:
-    """Errors after `elapsed` seconds of rocking; `ground`: acceleration [g] and weight (`Shaking.at`); `step`: what
-    the engine's own approximation adds to the errors of angle and velocity [rad]. Rounding is added here."""
+    """Return the errors after `elapsed` seconds of rocking, rounding included.
+
+    `ground`: acceleration [g] and weight (`Shaking.at`); `step`: errors of angle and velocity [rad] that the engine's
+    own approximation adds.
+    """
     given = stepper, state, angle, ground, elapsed, step
     stepper, state, angle, (acceleration, weight), elapsed, step = fixed(given)
     push = state.side * acceleration
@@ -67,23 +70,23 @@ def errors_after(
 
 
 def rounded(stepper: AbstractStepper, state: State, push: Scalar, time: Scalar) -> tuple[Scalar, Scalar]:
-    """What rounding adds to the errors of angle and velocity in a step of `time` (p t), under a ground acceleration of
-    this size [g]."""
+    """Return the errors of angle and velocity that rounding adds in a step of `time` (p t), for |ground acceleration|
+    `push` [g]."""
     moments, p = stepper.scene.moments, stepper.scene.p
     eps, speed = 2 * jnp.finfo(p.dtype).eps, jnp.abs(state.velocity)
     clock = p * state.local  # the time of a state is rounded, too
-    pull = eps * (moments.restoring_at_rest + push * moments.arm_at_rest)  # of what acceleration is left
+    pull = eps * (moments.restoring_at_rest + push * moments.arm_at_rest)  # its terms may cancel
     of_angle = eps * (jnp.abs(state.opening) + speed * (time + clock)) + pull * time**2
     return of_angle, eps * speed + pull * (time + clock)
 
 
 def note(stepper: AbstractStepper, state: State, outward, turning, crossing, opening, speed, acceleration) -> State:
-    """Keep peaks and how close the block came to standing still in balance (see `Outcome.margin`)."""
+    """Update peaks, clearances and the closeness to standing still in balance (see `Outcome.margin`)."""
     moments = stepper.scene.moments
-    # The acceleration with or without the shaking, whichever is larger: a block that the ground holds for an
-    # instant, far from its saddle, is not in balance.
+    # Take the larger acceleration, with or without the shaking: a block that the ground holds for an instant, far from
+    # its saddle, is not in balance.
     pull = jnp.maximum(jnp.abs(acceleration), jnp.abs(moments.restoring(Angle.of(opening))))
-    per_rest = 1 / moments.restoring_at_rest**2  # the same at every step: computed once
+    per_rest = 1 / moments.restoring_at_rest**2  # `keep` below has XLA compute the product once
     stillness = keep((moments.stiffness * speed**2 + pull**2) * per_rest, state.local)
     turn = turning & (outward | state.beyond)
     closeness = where(turn, jnp.minimum(state.closeness, stillness), state.closeness)
@@ -92,12 +95,12 @@ def note(stepper: AbstractStepper, state: State, outward, turning, crossing, ope
     beyond = where(turning & state.beyond, jnp.minimum(beyond, stillness), beyond)
     higher = turning & outward
     first = higher & surpasses(opening, state.peak)
-    # Turning back just above the ground, within the error of the angle: there may have been an impact.
+    # A turn back just above the ground, within the error of the angle, may have been an impact.
     angle = state.spread.angle
     off = jnp.abs(opening) + angle
     grazing = turning & ~outward & (off <= GRAZING * angle)
     graze = where(grazing, 8 * jnp.abs(acceleration) * off, 0.0)
-    # Standing still in balance, within the error of the state along which it leaves.
+    # Standing still in balance, within the error of the state in the direction in which it leaves.
     balanced = (turning | crossing) & (speed**2 + pull**2 <= stepper.doubt**2 * state.spread.variance(1.0, 1.0))
     if stepper.scene.falls_flat:
         balanced = balanced | (higher & (jnp.abs(opening - jnp.pi / 2) <= stepper.doubt * angle))

@@ -1,4 +1,5 @@
-"""The events that end a step, in one list: what an engine watches, and what is exact where one happens."""
+"""The events that end a step, in one list: the guards that an engine watches, and the values that an event sets
+exactly."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -14,7 +15,7 @@ Flag = Bool[Array, ""]
 
 
 class Events(NamedTuple):
-    """Something of every event; of a step, whether it ends there.
+    """One value per kind of event; for a step, whether that event ends it.
 
     Impact; turning point; extremum of the velocity; the saddle, where the block balances; flat on the ground.
     """
@@ -27,7 +28,7 @@ class Events(NamedTuple):
 
 
 class Watched(NamedTuple):
-    """An event is where a derivative of the opening angle passes a level."""
+    """A guard: the event is where a derivative of the opening angle passes a level."""
 
     derivative: int
     level: Callable[[Scene], Scalar | float]
@@ -43,11 +44,12 @@ WATCHED = Events(
 
 
 def level_of(scene: Scene, hits: Events) -> Scalar:
-    """The opening angle at which a step ends, if it ends at one."""
+    """Return the opening angle at which a step ends, if an event sets it."""
     return where(hits.saddle, scene.moments.saddle, where(hits.flat, jnp.pi / 2, 0.0))
 
 
 def landed(scene: Scene, hits: Events, opening: Scalar, velocity: Scalar) -> tuple[Scalar, Scalar]:
-    """Opening angle and velocity at the end of a step, exact where its event sets them; at an impact `impact` does."""
+    """Return opening angle and velocity at the end of a step, exact where its event sets them. At an impact, `impact`
+    sets them."""
     opening = where(hits.flat, jnp.pi / 2, where(hits.saddle, scene.moments.saddle, opening))
     return opening, where(hits.turning, 0.0, velocity)

@@ -1,9 +1,8 @@
-"""The free stage: what a rocking block does after the ground has come to rest, by energy alone.
+"""The free stage: the response after the ground has come to rest, from energy alone.
 
-Velocities are per dimensionless time p t. With x half the angle that is missing to the saddle, the free
-equation is dx/dtau = sqrt(sin^2 x - k^2): its times are elliptic integrals of the first kind (logarithms
-in the linear model; quadrature in `skewed` where a constant adds to the sinusoid), its peaks and verdicts follow
-from the energy.
+Velocities are per dimensionless time p t. With x half the angle that is missing to the saddle, the free equation is
+dx/dtau = sqrt(sin^2 x - k^2). Its times are elliptic integrals of the first kind, or logarithms in the linear model.
+Where a constant adds to the sinusoid, `skewed` computes them by quadrature. Peaks and verdicts follow from the energy.
 """
 
 import functools
@@ -35,15 +34,15 @@ class FreeStage(eqx.Module):
     peak: Scalar  # largest opening angle still to come
     peak_time: Scalar
     peak_steepness: Scalar  # -2 (change of the energy with the peak)
-    peak_share: Scalar  # of an error of the present energy that is left in that of the peak
+    peak_share: Scalar  # share of an error of the present energy that remains in that of the peak
     fastest: Scalar  # largest speed still to come
     closeness: Scalar  # smallest squared distance from standing still in balance still to come
     deficit: Scalar  # 2 (energy of the saddle - energy) of the excursion that decides [rad^2]
-    share: Scalar  # of an error of the present energy that is left in it
+    share: Scalar  # share of an error of the present energy that remains in `deficit`
 
     @classmethod
     def none(cls, like: Scalar) -> "FreeStage":
-        """Of a block that does not move."""
+        """Return the result for a block that does not move."""
         zero, one, no = jnp.zeros_like(like), jnp.ones_like(like), jnp.zeros_like(like, bool)
         return cls(
             overturned=no,
@@ -60,7 +59,7 @@ class FreeStage(eqx.Module):
 
 
 def carlson_rf(x: Scalar, y: Scalar, z: Scalar) -> Scalar:
-    """Carlson's elliptic integral R_F by duplication (Carlson 1979; DLMF 19.36.1)."""
+    """Compute Carlson's elliptic integral R_F by duplication (Carlson 1979; DLMF 19.36.1)."""
     return _carlson_rf(x, y, z)[0]
 
 
@@ -84,7 +83,7 @@ _carlson_rf = Compound("carlson_rf", _carlson_rf_written)
 
 
 def _time_to_peak(moments: Coefficients, gap: Scalar, manifold: Scalar, speed: Scalar) -> Scalar:
-    """Time from opening angle saddle - gap, moving outward below the manifold, to the turning point."""
+    """Return the time from opening angle saddle - gap, moving outward below the manifold, to the turning point."""
     if not moments.sinusoidal:
         return jnp.arctanh(speed / manifold)
     if moments.skew is not None:
@@ -98,7 +97,7 @@ def _time_to_peak(moments: Coefficients, gap: Scalar, manifold: Scalar, speed: S
 
 
 def _time_to_impact(moments: Coefficients, gap: Scalar, manifold: Scalar, speed: Scalar, base: Scalar, arrival: Scalar):
-    """Time from opening angle saddle - gap, moving inward, to the impact at speed `arrival`."""
+    """Return the time from opening angle saddle - gap, moving inward, to the impact at speed `arrival`."""
     if not moments.sinusoidal:
         return jnp.log((base + arrival) / (manifold + speed))
 
@@ -125,7 +124,7 @@ class Visit(NamedTuple):
     """A stay on one side, until the impact that ends it."""
 
     moments: Coefficients
-    reset: Reset  # that impact
+    reset: Reset  # the impact that ends the stay
 
 
 def free_stage(
@@ -135,13 +134,12 @@ def free_stage(
 
     **Arguments:**
 
-    - `visits`: the sides on which it stands, first the present one, as many as may decide: two for a symmetric block,
-      three for an asymmetric one. Of these the last decides nothing if the block moves outward now: it comes back to
-      the same side with less energy.
+    - `visits`: the sides on which it stands, the present one first: two for a symmetric block, three for an asymmetric
+      one. The last decides nothing if the block moves outward now: it comes back to the same side with less energy.
     - `opening`: opening angle [rad], 0 or more.
     - `velocity`: its derivative with respect to p t [rad], positive outward.
-    - `moving`: whether the block rocks at all; if not, nothing comes.
-    - `known`: the largest opening angle so far [rad]: the time of a peak that is lower is not computed.
+    - `moving`: whether the block rocks at all; if not, nothing happens.
+    - `known`: the largest opening angle so far [rad]: the time of a lower peak is not computed.
     - `falls_flat`: whether it overturns at pi/2, if a saddle lies beyond.
 
     **Returns:** a `FreeStage`.
@@ -157,14 +155,14 @@ def free_stage(
         reset = visits[i - 1].reset
         ratio = reset.ratio(arrival)
         rebound = ratio * arrival
-        share = share * jnp.abs(ratio * reset.slope(arrival))  # of a change of the energy
+        share = share * jnp.abs(ratio * reset.slope(arrival))  # share of a change of the energy
         stay = _after_impact(visit.moments, rebound, happens, falls_flat)
         lost, impacts = lost | stay.lost, where(stay.lost, i, impacts)
         arrival = rebound
         found.append(stay)
         shares.append(share)
 
-    # Of several peaks the highest, of equal ones the first.
+    # Take the highest of several peaks, and the first of equal ones.
     zero = jnp.zeros_like(opening)
     peak, best, steepness, peak_share, highest = zero, known, jnp.ones_like(opening), share, []
     closeness = deficit = narrowest = jnp.full_like(opening, jnp.inf)
@@ -178,7 +176,7 @@ def free_stage(
         peak = where(stay.safe & (stay.peak > peak), stay.peak, peak)
         fastest = where(stay.safe, jnp.maximum(fastest, stay.arrival), fastest)
         closeness = where(stay.lost, stay.closeness, jnp.minimum(closeness, stay.closeness))
-        # In terms of the present energy.
+        # Compare the deficits in terms of the present energy.
         missing = jnp.abs(stay.deficit) / where(share > 0, share, 1.0)
         narrow = stay.decides & (missing < narrowest)
         deficit, decisive = where(narrow, stay.deficit, deficit), where(narrow, share, decisive)
@@ -191,7 +189,7 @@ def free_stage(
             at = where(higher, top, at)
         return at
 
-    # Elliptic integrals cost more than all the rest: most peaks come before the free stage.
+    # Elliptic integrals cost more than all the rest, and most peaks come before the free stage.
     peak_time = jax.lax.cond(functools.reduce(jnp.logical_or, highest), time, lambda: zero)
     return FreeStage(
         overturned=lost,
@@ -208,21 +206,24 @@ def free_stage(
 
 
 class _Stay(NamedTuple):
-    """What a block does on one side in the free stage."""
+    """The motion of a block on one side in the free stage."""
 
-    lost: Flag  # it falls on this side
-    safe: Flag  # it moves there and comes back
-    decides: Flag  # whether it falls here is decided by its energy
+    lost: Flag  # the block falls on this side
+    safe: Flag  # the block moves on this side and comes back
+    decides: Flag  # whether it falls here depends on its energy
     deficit: Scalar  # 2 (energy at which it falls - energy)
-    peak: Scalar  # highest opening angle; zero if it only comes back
+    peak: Scalar  # highest opening angle; zero if the block only comes back
     steepness: Scalar  # -2 (change of energy with the peak)
     closeness: Scalar
     arrival: Scalar  # speed at the impact that ends it
-    times: Callable  # of the time at which it begins: those of its peak, and of the impact that ends it
+    times: Callable  # map the start time to the times of the peak and of the impact that ends it
 
 
 def _peak_of(moments: Coefficients, deficit: Scalar) -> Scalar:
-    """Opening angle at which a block turns back; deficit: 4 sin^2(half the angle to the saddle), or its square."""
+    """Return the opening angle at which a block turns back.
+
+    `deficit`: 4 sin^2(half the angle to the saddle), or the square of that angle in the linear model.
+    """
     if moments.skew is not None:
         return moments.saddle - skewed.turning_gap(deficit, moments.skew, moments.saddle)
     missing = jnp.sqrt(jnp.maximum(deficit, 0.0))
@@ -230,12 +231,13 @@ def _peak_of(moments: Coefficients, deficit: Scalar) -> Scalar:
 
 
 def _weight(moments: Coefficients) -> Scalar:
-    """What makes squared velocities and accelerations, in units of the stiffness, a closeness."""
+    """Return the factor from squared velocities and accelerations, in units of the stiffness, to a closeness."""
     return (moments.stiffness / moments.restoring_at_rest) ** 2
 
 
 def _turning_closeness(moments: Coefficients, gap2: Scalar, beyond: bool = False) -> Scalar:
-    """Squared acceleration at a turning point over that at rest; gap2: 4 sin^2(half the angle to the saddle)."""
+    """Return the squared acceleration at a turning point over that at rest; gap2: 4 sin^2(half the angle to the
+    saddle)."""
     if moments.skew is not None:
         skew, reach = (-moments.skew, jnp.pi / 2 - moments.saddle) if beyond else (moments.skew, moments.saddle)
         return _weight(moments) * skewed.moment(skewed.turning_gap(gap2, skew, reach), skew) ** 2
@@ -248,7 +250,7 @@ def _steepness(moments: Coefficients, peak: Scalar) -> Scalar:
 
 
 def _flat(moments: Coefficients, falls_flat: bool) -> tuple[Scalar | float, Flag | bool]:
-    """What a block that lies flat lacks of the energy of a saddle beyond, as a `deficit`; and whether it is beyond."""
+    """Return the `deficit` of lying flat below a saddle beyond pi/2, and whether the saddle is beyond."""
     if not falls_flat:
         return 0.0, False
     saddle = moments.saddle
@@ -259,7 +261,8 @@ def _flat(moments: Coefficients, falls_flat: bool) -> tuple[Scalar | float, Flag
 def _present(
     moments: Coefficients, opening: Scalar, velocity: Scalar, moving: Flag, falls_flat: bool, comes_back: bool
 ) -> _Stay:
-    """The stay on the side where the block is when the motion ends; `comes_back`: whether it matters when it does."""
+    """Compute the stay on the side where the block is when the motion ends; `comes_back`: whether its return matters.
+    Compute the stay on the side where the block is when the motion ends; `comes_back`: whether its return matters."""
     level, flat = _flat(moments, falls_flat)
     rate = jnp.sqrt(moments.stiffness)
     gap, speed = moments.saddle - opening, velocity / rate
@@ -306,7 +309,7 @@ def _present(
 
 
 def _after_impact(moments: Coefficients, rebound: Scalar, happens: Flag, falls_flat: bool) -> _Stay:
-    """The stay on a side on which the block comes to stand with a velocity; if it happens at all."""
+    """Compute the stay on the side that the block enters by an impact, where that happens."""
     level, flat = _flat(moments, falls_flat)
     rate = jnp.sqrt(moments.stiffness)
     base, speed = moments.manifold(jnp.zeros_like(rebound)) / rate, rebound / rate

@@ -1,11 +1,15 @@
 """The impact: the one place where a block's state is reset, by its law of restitution.
 
-After an impact at speed v the block hops for 2 v/a, a the deceleration on that side; the hops to come last
-2 v (1/a + e'/a')/(1 - e e'), with a' and e' on the other side. They are replaced by rest where it is certain
-that they end before the forcing has changed by half of the weaker deceleration (so all speeds stay below
-e^(1/2) those of constant forcing, and all hops end within four times that time), and that none is higher,
-faster or closer to overturning than what has been. Each is slower by e, so those above the rounding of alpha
-can be counted.
+After an impact at speed v the block hops for 2 v/a, where a is the deceleration on that side. All hops to come last 2 v
+(1/a + e'/a')/(1 - e e'), with a' and e' on the other side.
+
+They are replaced by rest on two conditions:
+
+- They certainly end before the forcing has changed by half of the weaker deceleration. Then all speeds stay below
+  e^(1/2) those of constant forcing, and all hops end within four times that time.
+- No hop is higher, faster or closer to overturning than the block has been.
+
+Each hop is slower by e, so those above the rounding of alpha can be counted.
 """
 
 import functools
@@ -33,8 +37,8 @@ class _Rebound(NamedTuple):
     """A block that has just come down on its other side."""
 
     speed: Scalar  # outward, after the impact
-    here: Scalar  # decelerations there,
-    there: Scalar  # and on the side that it came from
+    here: Scalar  # decelerations on its side,
+    there: Scalar  # and on the side from which it came
     spread: Spread
 
 
@@ -43,17 +47,17 @@ def impact(
 ) -> State:
     """Change side with the restitution; come to rest where the impacts to come no longer matter.
 
-    `ground`: acceleration [g] and weight (`Shaking.at`); for `reach` seconds from now horizontal and vertical
+    `ground`: acceleration [g] and weight (`Shaking.at`). Within `reach` seconds from now the horizontal and vertical
     acceleration change by `steepest` [g/s] at most.
     """
     rebound = _rebound(stepper, state, speed, ground)
-    slowed = hit & (rebound.there < 0)  # by the forcing, before it hit the ground: else it would have turned back
+    slowed = hit & (rebound.there < 0)  # by the forcing, before the impact: otherwise it would have turned back
     depth = jax.lax.cond(
         slowed, lambda: speed**2 / (2 * where(slowed, -rebound.there, 1.0)), lambda: jnp.zeros_like(speed)
     )
     rests, more, wait = _rests_if_soon(stepper, state, hit, rebound, steepest, reach)
     fastest = state.fastest
-    if stepper.scene.far is not None:  # of corners of unequal height an impact may hasten it about one
+    if stepper.scene.far is not None:  # with unequal corners the rebound may be faster than the approach
         fastest = where(hit & (rebound.speed > fastest), rebound.speed, fastest)
     return replace(
         state,
@@ -74,7 +78,7 @@ def impact(
 
 
 def _rebound(stepper: AbstractStepper, state: State, speed: Scalar, ground: tuple) -> _Rebound:
-    """What follows an impact at `speed` < 0."""
+    """Compute the state just after an impact at `speed` < 0."""
     scene, (moments, ahead), side = stepper.scene, stepper.scene.both_moments, -state.side
     before = jnp.abs(speed)
     ratio = scene.reset.ratio(before)
@@ -88,10 +92,10 @@ def _rebound(stepper: AbstractStepper, state: State, speed: Scalar, ground: tupl
 def _rests_if_soon(
     stepper: AbstractStepper, state: State, hit: Flag, after: _Rebound, steepest: tuple, reach: Scalar
 ) -> tuple[Flag, Int[Array, ""], Scalar]:
-    """As `_rests`, which is not asked where the next hop alone takes too long for that."""
+    """Call `_rests` only where the next hop is short enough for it."""
     given = stepper, state, hit, after, steepest, reach
     stepper, state, hit, after, steepest, reach = fixed(given)
-    # Of no speed it is; unless the ground throws the block on at once, which then moves on as from any speed.
+    # Zero speed counts as soon, unless the ground throws the block on at once; then it moves on as from any speed.
     soon = hit & (8 * after.speed <= reach * stepper.scene.p * after.here)
 
     def never():
@@ -103,7 +107,7 @@ def _rests_if_soon(
 def _rests(
     stepper: AbstractStepper, state: State, hit: Flag, after: _Rebound, steepest: tuple, reach: Scalar
 ) -> tuple[Flag, Int[Array, ""], Scalar]:
-    """Whether a block comes to rest by the impacts to come, the number of these, and how long they take [s]."""
+    """Return whether the impacts to come bring the block to rest, their number, and the time they take [s]."""
     scene, rebound = stepper.scene, after.speed
     e, back = scene.reset.most(rebound), scene.far_reset.most(rebound)
     weaker = jnp.minimum(after.here, after.there)
@@ -113,9 +117,9 @@ def _rests(
     window = 4 * remaining / scene.p
     change = functools.reduce(jnp.maximum, [m.change_at_rest(*steepest) for m in scene.different_moments])
     dies = held & (change * window <= weaker / 2) & (window <= reach)
-    # Speed of a hop of rounding height; a history shows the hops down to there.
+    # Speed of a hop of rounding height; a history shows the hops down to that speed.
     low = jnp.sqrt(100 * jnp.finfo(scene.p.dtype).eps * scene.alpha * jnp.minimum(here, there))
-    if stepper.history or scene.reset.depends_on_speed:  # the ratios of later impacts are not known
+    if stepper.history or scene.reset.depends_on_speed:  # later ratios are unknown
         dies = dies & (rebound <= low)
     if not stepper.history:
         highest = 3 * rebound**2 * jnp.maximum(1 / here, back * back / there)
@@ -125,7 +129,7 @@ def _rests(
             top = Angle.of(jnp.minimum(highest, moments.saddle))
             dies = dies & ((moments.restoring(top) / moments.restoring_at_rest) ** 2 >= state.closeness)
     rests = keep_flag(hit & (dies | (rebound == 0)), state.local)
-    slower = e if scene.far is None else jnp.sqrt(e * back)  # from hop to hop, in the mean
+    slower = e if scene.far is None else jnp.sqrt(e * back)  # mean ratio of speeds from hop to hop
     more = logarithm(low / jnp.maximum(rebound, low)) / logarithm(jnp.clip(slower, 1e-3, 1 - 1e-9))
     more = where(rests, jnp.ceil(more).astype(state.impacts.dtype), 0)
     return rests, more, where(rests & (rebound > 0), remaining / scene.p, 0.0)

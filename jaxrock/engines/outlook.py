@@ -1,4 +1,4 @@
-"""What the ground may still do: bounds of all that is to come, from each piece of a motion on."""
+"""Bounds of the forcing still to come, from each piece of a motion on."""
 
 import equinox as eqx
 import jax
@@ -26,7 +26,7 @@ class _Ahead(eqx.Module):
 
     @classmethod
     def of(cls, bounds: Bounds) -> "_Ahead":
-        """Of a component; no derivatives."""
+        """Compute the bounds of a component, without derivatives."""
         values = jax.lax.stop_gradient(jnp.pad(bounds.values, (0, 1)))
         if values.size <= _NEAR:
             return cls(bounds, _maximum_to_end(values, bounds.left), values, values)
@@ -34,13 +34,13 @@ class _Ahead(eqx.Module):
         return cls(bounds, to_end if bounds.left is None else _maximum_to_end(values, bounds.left), near, far)
 
     def at(self, values: Inexact[Array, " knots"], piece: Int[Array, ""]) -> Scalar:
-        """One of these bounds."""
+        """Look up one of these arrays at a piece, times the gain."""
         return self.bounds.times_gain(pick(values, piece))
 
 
 class Outlook(eqx.Module):
-    """What each component of the ground may still do, and whether that lifts a block that rests while
-    |u| < threshold (1 + v)."""
+    """Bounds of each component of the forcing still to come, and whether it lifts a block that rests while |u| <
+    threshold (1 + v)."""
 
     horizontal: _Ahead
     vertical: _Ahead | None
@@ -48,13 +48,13 @@ class Outlook(eqx.Module):
 
     @classmethod
     def of(cls, envelope: Envelope, threshold: Scalar) -> "Outlook":
-        """The outlook at the start."""
+        """Build the outlook of a motion."""
         vertical = None if envelope.vertical is None else _Ahead.of(envelope.vertical)
         return cls(_Ahead.of(envelope.horizontal), vertical, threshold)
 
     @property
     def strongest_drive(self) -> Scalar:
-        """Bound of what ever acts against the threshold [g], with its derivatives."""
+        """Return a bound of the drive against the threshold over the whole motion [g], with its derivatives."""
         horizontal = self.horizontal.bounds
         if self.vertical is None:
             return horizontal.strongest
@@ -63,33 +63,35 @@ class Outlook(eqx.Module):
         return jnp.max(horizontal.times_gain(horizontal.values) + weight)
 
     def _drive(self, piece: Int[Array, ""], which: str) -> Scalar:
-        """Bound of what acts against the threshold [g]; for what is at rest while |u| + threshold |v| < threshold."""
+        """Return a bound of the drive against the threshold [g]; a block stays at rest while |u| + threshold |v| <
+        threshold."""
         drive = self.horizontal.at(getattr(self.horizontal, which), piece)
         if self.vertical is None:
             return drive
         return drive + self.threshold * self.vertical.at(getattr(self.vertical, which), piece)
 
     def is_over(self, piece: Int[Array, ""]) -> Bool[Array, ""]:
-        """Whether nothing from a piece on lifts a block at rest."""
+        """Return whether no forcing from a piece on lifts a block at rest."""
         return self._drive(piece, "to_end") <= self.threshold
 
     def after_quiet(self, piece: Int[Array, ""]) -> Int[Array, ""]:
-        """First piece from `piece` on that may uplift a block at rest; cheap, so it may stop early."""
+        """Return the first piece from `piece` on that may uplift a block at rest; the search is cheap and may stop
+        early."""
         if self.horizontal.near.size <= _NEAR:
             return piece
         far, near = (self._drive(piece, which) < self.threshold for which in ("far", "near"))
         return piece + where(far, _FAR, where(near, _NEAR, 0))
 
     def most_helpful(self, piece: Int[Array, ""]) -> tuple[Scalar, Scalar | None]:
-        """The forcing [g] and weight still to come that do most for a block past its saddle."""
+        """Return the forcing [g] and the weight still to come that most help a block past its saddle."""
         most, vertical = self.horizontal.at(self.horizontal.to_end, piece), self.vertical
         return most, None if vertical is None else 1 - vertical.at(vertical.to_end, piece)
 
 
 def _maxima(values: Inexact[Array, " n"]) -> tuple[Inexact[Array, " n"], ...]:
-    """Largest of the values from each position on: to the end, of the next 16, and of the next 256.
+    """Return the largest of the values from each position on: to the end, of the next 16, and of the next 256.
 
-    In one loop: a loop takes XLA longer to compile than all else around a scene.
+    One loop computes all three: XLA takes longer to compile a loop than everything else around a scene.
     """
 
     def wider(k, maxima):
@@ -99,16 +101,18 @@ def _maxima(values: Inexact[Array, " n"]) -> tuple[Inexact[Array, " n"], ...]:
 
     size = values.size
     far, near = jax.lax.fori_loop(0, min(size - 1, _FAR - 1).bit_length(), wider, (values, values))
-    # To the end: the next 256, and whole stretches of as many beyond the one in which these begin.
-    stretches = jax.lax.cummax(far[::_FAR], reverse=True)  # few, of which XLA may take the square
+    # To the end: the next 256 values, then the maxima of whole stretches of 256 beyond.
+    stretches = jax.lax.cummax(far[::_FAR], reverse=True)  # few, as XLA may take n^2 operations
     beyond = jax.lax.concatenate([stretches[1:], jax.lax.full((1,), 0.0, values.dtype)], 0)
     beyond = jax.lax.broadcast_in_dim(beyond, (beyond.size, _FAR), (0,)).reshape(-1)[:size]
     return jax.lax.max(far, beyond), near, far
 
 
 def _maximum_to_end(values: Inexact[Array, " n"], left: Int[Array, " m"] | None) -> Inexact[Array, " n"]:
-    """Largest of the values from each position on, or of so many as are `left`; XLA's own takes n^2 operations on
-    CPUs."""
+    """Return the largest of the values from each position on, or of the next `left` ones.
+
+    XLA's own cumulative maximum takes n^2 operations on CPUs.
+    """
     times, size = (values.size - 1).bit_length(), values.size
     if left is not None:
         room = jnp.pad(left, (0, size - left.size))
@@ -121,8 +125,10 @@ def _maximum_to_end(values: Inexact[Array, " n"], left: Int[Array, " m"] | None)
 def _wider(
     values: Inexact[Array, " n"], reach: Int[Array, ""], room: Int[Array, " n"] | None = None
 ) -> Inexact[Array, " n"]:
-    """Each value, or the one `reach` further on if that is larger (zeros beyond the end, and beyond the `room` that is
-    left from a position on; none is negative)."""
+    """Return the elementwise maximum of each value and the one `reach` positions later.
+
+    Positions past the end, or past the `room` left from a position on, count as zero; no value is negative.
+    """
     beyond = jnp.concatenate([values, jnp.zeros_like(values)])
-    more = jax.lax.dynamic_slice_in_dim(beyond, reach, values.size, allow_negative_indices=False)  # zeros are the last
+    more = jax.lax.dynamic_slice_in_dim(beyond, reach, values.size, allow_negative_indices=False)  # zeros end it
     return jnp.maximum(values, more if room is None else where(reach < room, more, 0.0))

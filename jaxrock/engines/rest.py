@@ -1,4 +1,4 @@
-"""A block at rest: waiting for the ground to lift it."""
+"""A block at rest: the wait until the ground uplifts it."""
 
 import functools
 import operator
@@ -25,24 +25,24 @@ Flag = Bool[Array, ""]
 def wait(
     stepper: AbstractStepper, state: State, shaking: Shaking, unit: Scalar, order: int, tolerance: float, branch
 ) -> State:
-    """At rest: go on to the knot, or to where the ground lifts the block (`branch`: see `when`)."""
+    """Advance a block at rest to the knot, or to the time at which the ground uplifts it (`branch`: see `when`)."""
     scene, eps = stepper.scene, jnp.finfo(state.local.dtype).eps
     room = stepper.room(state) / unit
     length = longest_wait(stepper, shaking, room, order, tolerance)
     never = scene.outlook.is_over(state.piece)
-    # How far a step goes changes nothing: it has no derivative.
+    # The state at rest does not depend on the length of a step: the length has no derivative.
     room, length = fixed((room, where(jnp.isfinite(length), length, 0.0)))
-    lasting = room > 0  # in a piece without a length nothing happens
+    lasting = room > 0  # in a zero-length piece nothing happens
     zero = jnp.zeros_like(length)
     lifted, found = [], []
-    # A ground that does not change is the same at any scale; powers of a long time would overflow.
+    # A constant ground is the same at any scale; powers of a long time would overflow.
     for drive, level in scene.drives_of(shaking.rescaled(where(_changes(shaking), length, 0.0))):
         held, high = fixed((drive, level))
         slope = held[1] if len(held) > 1 else zero
         slack = 8 * eps * high
         touching = lasting & (jnp.abs(high - held[0]) <= slack)
         lifts = lasting & (high - held[0] < -slack) | (touching & (slope > 0))
-        # A threshold that is touched already counts as passed when it is left behind by more than rounding.
+        # A threshold that the drive touches at the start counts as passed only beyond rounding.
         least = high + where(touching, 2 * slack, 0.0)
 
         def search(found, needed, inside, held=held, least=least):
@@ -51,7 +51,7 @@ def wait(
             landing = first_event(series, [watch], zero, needed)
             return landing.x, landing.hits[0] & (landing.jet[1] > 0)
 
-        # What is not a number is looked for, too: it ends in a status.
+        # The comparison is negated, so that NaN takes the branch too and ends in a status.
         reachable = lasting & ~lifts & ~never & (state.side == 0) & ~(sum(jnp.abs(c) for c in held) < high)
         x, met = branch(reachable, search, (jnp.ones_like(length), jnp.zeros_like(lifts)))
         found.append((where(met, meet(x, drive, level), x), met, x))
@@ -72,9 +72,11 @@ def wait(
 
 
 def _moved_by_ties(stepper: AbstractStepper, state: State, shaking: Shaking, tied: Flag, after: State) -> State:
-    """Between knots that come together nothing is lifted; but where the ground would lift the block there, and does so
-    at the last of them, it does as soon as one of them goes. So the velocity of a block at rest has a derivative, which
-    does not outlast a wait in which it is not lifted at once."""
+    """Let a block at rest move with knots that coincide; between these nothing is lifted.
+
+    Where the last of these knots lifts the block at once, the ground would lift it as soon as the knots part. The
+    velocity of a block at rest therefore has a derivative, which ends with a wait that does not lift the block at once.
+    """
     scene, eps = stepper.scene, jnp.finfo(state.local.dtype).eps
     velocity, zero = state.velocity, jnp.zeros_like(state.opening)
     push, weight = shaking.now
@@ -89,19 +91,19 @@ def _moved_by_ties(stepper: AbstractStepper, state: State, shaking: Shaking, tie
 
 
 def longest_wait(stepper: AbstractStepper, shaking: Shaking, room: Scalar, order: int, tolerance: float) -> Scalar:
-    """For how long the series tell what the ground does, at most `room`."""
+    """Return the time for which the series represent the ground motion, at most `room`."""
     length = room
     parts: list[tuple] = [(shaking.horizontal, stepper.scene.threshold), (shaking.vertical, 1.0)]
     for terms, scale in parts:
         if terms is not None and len(terms) > order:  # else a polynomial: exact
             cap = jnp.minimum(room, longest(len(terms), room.dtype))
-            cap = where(_changes(shaking), cap, room)  # zeros need none
+            cap = where(_changes(shaking), cap, room)  # a constant needs no cap
             length = jnp.minimum(length, step_length(terms, tolerance * scale, cap))
     return length
 
 
 def _changes(shaking: Shaking) -> Flag:
-    """Whether the acceleration of the ground has more terms than its first."""
+    """Return whether any Taylor coefficient of the ground acceleration after the first is nonzero."""
     later = [*shaking.horizontal[1:], *(shaking.vertical or [])[1:]]
     return functools.reduce(operator.or_, [c != 0 for c in later], jnp.zeros((), bool))
 
@@ -109,7 +111,8 @@ def _changes(shaking: Shaking) -> Flag:
 def lift(state: State, side: Scalar, lifts: Flag, continuous: Flag, at_once: Flag) -> State:
     """Leave rest to a side where `lifts`; `continuous`: with zero acceleration.
 
-    Where that is `at_once` the state that was given at time 0 moves on, of one side; it does not outlast a wait.
+    Where uplift is `at_once`, the derivatives of the initial state continue, with the sign of that side. A wait ends
+    them.
     """
     moving = where(at_once, side, 0.0)
     opening, velocity = (with_derivatives_of(fixed(x), moving * x) for x in (state.opening, state.velocity))

@@ -23,8 +23,8 @@ from jaxrock.numerics.choice import where
 from jaxrock.numerics.lookup import pick
 
 Scalar = Inexact[Array, ""]
-_MANY = 32  # pieces, from which on there may be room for more
-_TOGETHER = 4  # knots that come together, of motions at once
+_MANY = 32  # number of pieces from which on the knot array may be padded beyond the motion's end
+_TOGETHER = 4  # pieces to step back in a sum of motions, whose knots may coincide
 
 
 def peak_bound(motion: AbstractMotion) -> Scalar:
@@ -33,8 +33,8 @@ def peak_bound(motion: AbstractMotion) -> Scalar:
 
 
 def _moments(block: Block | AsymmetricBlock, model: AbstractEquation) -> tuple:
-    """Coefficients of side 1, and of side 2 if it has one of its own; times are p t, or p1 t on both sides."""
-    if is_ours(model):  # of what is traced they were asked before (`responses.current_model`): none in machine code
+    """Return the moments of side 1, and of side 2 if it has its own; time is p t, or p1 t on both sides."""
+    if is_ours(model):  # `responses.current_model` checks traced parameters beforehand: machine code holds no checks
         with put_down():
             return _made(block, model)
     return _made(block, model)
@@ -53,18 +53,18 @@ def _least_threshold(moments: AbstractMoments, far: AbstractMoments | None) -> S
 
 
 def _endless(values: Inexact[Array, " pieces"], count: Int[Array, ""] | None) -> Inexact[Array, " knots"]:
-    """Values of pieces, and infinity for what comes after the last."""
+    """Append infinity for the quiet after the last piece; pieces past `count` are infinite, too."""
     values = jnp.concatenate([values, jnp.full(1, jnp.inf, values.dtype)])
     return values if count is None else where(jnp.arange(values.size) < count, values, jnp.inf)
 
 
 def uplift_threshold(block: Block | AsymmetricBlock, model: AbstractEquation) -> Scalar:
-    """Ground acceleration at which a block uplifts, to its weaker side [g]."""
+    """Return the ground acceleration at which a block uplifts, to its weaker side [g]."""
     return _least_threshold(*_moments(block, model))
 
 
 class Here(NamedTuple):
-    """The one piece of which a step is told, where derivatives by a whole motion become those by a few numbers."""
+    """The one piece that a taped step knows: derivatives by a whole motion become derivatives by a few numbers."""
 
     number: Int[Array, ""]
     start: Scalar  # [s]
@@ -74,34 +74,37 @@ class Here(NamedTuple):
 class Scene(eqx.Module):
     """One block under one motion. Piece `pieces` (one past the last) is the quiet after the motion.
 
-    A symmetric block has one `moments` for both sides. That of an asymmetric one, or of one whose law of restitution
-    tells sides apart, is for the side on which it stands (rotation > 0 unless `on` tells otherwise), and `far` for the
-    other.
+    A symmetric block has one `moments` for both sides, and `far` is None. For an asymmetric block, or a law of
+    restitution that differs between the sides, `moments` belongs to the present side and `far` to the other. The
+    present side is that with rotation > 0 unless `on` says otherwise.
     """
 
     moments: AbstractMoments
     far: AbstractMoments | None
-    p: Scalar  # unit of time and velocity on either side
-    alpha: Scalar  # size of an angle that matters
+    p: Scalar  # unit of time and velocity, on both sides
+    alpha: Scalar  # scale of an angle, for tolerances
     reset: Reset  # the impact that ends the stay on this side
-    far_reset: Reset  # on the other
+    far_reset: Reset  # the impact on the other side
     motion: AbstractMotion
     knots: Inexact[Array, " knots"]
-    scales: Inexact[Array, " knots"] | None  # None: straight lines
-    count: Int[Array, ""] | None  # of pieces before the end, where there may be some without length after it
-    following: Int[Array, " knots"] | None  # from each piece on the first that lasts; None: one after the other
+    scales: Inexact[Array, " knots"] | None  # None: every piece is a straight line
+    count: Int[Array, ""] | None  # pieces before the end; zero-length pieces may follow. None: all
+    following: Int[Array, " knots"] | None  # the first piece of positive length from each one on; None: the next one
     outlook: Outlook
     falls_flat: bool = eqx.field(static=True)
-    first: Int[Array, ""] | None = None  # piece, where the motion is one of many that follow one another; None: 0
-    room: int | None = eqx.field(static=True, default=None)  # for pieces of one of them
-    here: Here | None = None  # None: all are known
+    first: Int[Array, ""] | None = None  # first piece, where the array joins many motions; None: 0
+    room: int | None = eqx.field(static=True, default=None)  # most pieces of one of these motions
+    here: Here | None = None  # None: the whole motion is known
 
     @classmethod
     def of(
         cls, block: Block | AsymmetricBlock, motion: AbstractMotion, model: AbstractEquation, in_place: bool = False
     ) -> "Scene":
-        """Build the scene, of one record of many `in_place` or with arrays of its own; raise ValueError where a
-        parameter is an array outside of `jax.vmap`."""
+        """Build the scene.
+
+        With `in_place`, one record of many is read where it lies; else the scene has arrays of its own. Raises
+        ValueError where a parameter is an array outside of `jax.vmap`.
+        """
         check_single(block=block, motion=motion)
         dtype = jnp.result_type(*jax.tree.leaves((block, motion)))
         block, motion = in_precision(block, dtype), in_precision(motion, dtype)
@@ -110,8 +113,8 @@ class Scene(eqx.Module):
         knots, envelope = motion.knots, motion.envelope
         if stretch is not None:
             count = stretch.end
-        else:  # up to the last piece with a length: a late motion's knots may all be one number
-            # Of motions that end together one may go on longer: what lies between their ends has slopes.
+        else:  # up to the last piece of positive length: the knots of a late motion may all round to one number
+            # In a sum, parts that end together may move apart: zero-length pieces between their ends carry derivatives.
             count = motion.lasting.pieces if knots.size > _MANY and not is_of_several(motion) else None
         if envelope.vertical is not None and not model.feels_weight:
             raise ValueError(
@@ -145,16 +148,16 @@ class Scene(eqx.Module):
 
     @property
     def most_pieces(self) -> int:
-        """For how many pieces there is room."""
+        """Return the largest number of pieces, from static shapes."""
         return self.knots.size - 1 if self.room is None else self.room
 
     @property
     def pieces(self) -> Int[ArrayLike, ""]:
-        """Number of smooth pieces of the motion."""
+        """Return the number of smooth pieces of the motion."""
         return self.most_pieces if self.count is None else self.count
 
     def on(self, side: Scalar | float) -> "Scene":
-        """The scene as a block on this side sees it; at rest as on side +1."""
+        """Return the scene with the moments and resets of this side first; at rest those of side +1."""
         if self.far is None:
             return self
 
@@ -171,23 +174,23 @@ class Scene(eqx.Module):
 
     @property
     def both_moments(self) -> tuple[AbstractMoments, AbstractMoments]:
-        """Moments of this side and of the other."""
+        """Return the moments of this side and of the other."""
         return self.moments, self.moments if self.far is None else self.far
 
     @property
     def different_moments(self) -> tuple[AbstractMoments, ...]:
-        """The one moments, or both."""
+        """Return the moments without repetition: one entry for a symmetric block, else two."""
         return (self.moments,) if self.far is None else (self.moments, self.far)
 
     @property
     def threshold(self) -> Scalar:
-        """Ground acceleration below which the block stays at rest, to whichever side it goes [g]."""
+        """Return the ground acceleration below which the block stays at rest, whichever its weaker side [g]."""
         return _least_threshold(self.moments, self.far)
 
     def drives_of(self, shaking: Shaking) -> list[tuple[list[Scalar], Scalar]]:
-        """What lifts a block at rest to side 1 and to side -1, as a series, and the level above which it does.
+        """Return, for uplift to side 1 and to side -1, the drive as a series and the level that it must exceed.
 
-        To side s where -s u > threshold (1 + v).
+        The block uplifts to side s where -s u > threshold (1 + v).
         """
         found = []
         for side, moments in zip((1, -1), self.both_moments):
@@ -198,34 +201,35 @@ class Scene(eqx.Module):
         return found
 
     def after_quiet(self, piece: Int[Array, ""]) -> Int[Array, ""]:
-        """First piece from `piece` on that may uplift a block at rest; cheap, so it may stop early."""
+        """Return the first piece from `piece` on that may uplift a block at rest; the search is cheap and may stop
+        early."""
         later = self.outlook.after_quiet(piece)
-        if is_of_several(self.motion):  # those just before may have no length, but slopes
+        if is_of_several(self.motion):  # zero-length pieces just before may carry derivatives
             later = jnp.maximum(later - _TOGETHER, piece)
         return jnp.minimum(later, self.pieces)
 
     def from_here(self, piece: Int[Array, ""]) -> Int[Array, ""]:
-        """This piece, or, where it does not last, the first after it that does, if the scene tells which."""
+        """Return this piece, or the first one after it of positive length where `following` is known."""
         return piece if self.following is None else jnp.minimum(self.following[piece], self.pieces)
 
     def length(self, piece: Int[Array, ""]) -> Scalar:
-        """How long a piece lasts [s]; the quiet after the motion has no end."""
+        """Return the length of a piece [s]; the quiet after the motion has no end."""
         if self.here is not None:
             return self.here.length
         return where(piece < self.pieces, self.motion.length(jnp.minimum(piece, self.pieces - 1)), jnp.inf)
 
     def start(self, piece: Int[Array, ""]) -> Scalar:
-        """When a piece begins [s]."""
+        """Return the time at which a piece begins [s]."""
         if self.here is None:
             return pick(self.knots, piece)
         return self.here.start + where(piece > self.here.number, self.here.length, 0.0)
 
     def scale(self, piece: Int[Array, ""]) -> Scalar | float:
-        """Time in which the acceleration of a piece changes [s]."""
+        """Return the time in which the acceleration of a piece changes [s]."""
         return jnp.inf if self.scales is None else pick(self.scales, piece)
 
     def shaking(self, piece: Int[Array, ""], local: Scalar, order: int) -> tuple[Shaking, Scalar]:
-        """Taylor coefficients of the ground acceleration [g] in time/unit, and the unit [s]."""
+        """Return Taylor coefficients of the ground acceleration [g] in time/unit, and the unit [s]."""
         unit = 1 / self.p if self.scales is None else jnp.minimum(1 / self.p, self.scale(piece))
         during = piece < self.pieces
         inner = jnp.minimum(piece, self.pieces - 1)

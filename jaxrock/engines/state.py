@@ -1,4 +1,4 @@
-"""The state of a lane: one block under one motion, on its way."""
+"""The state of a lane: one block under one motion at one time."""
 
 from dataclasses import fields, replace
 
@@ -21,14 +21,14 @@ Flag = Bool[Array, ""]
 
 
 class State(eqx.Module):
-    """Where a lane is, and what it has seen so far. Velocities are per p t, angles in rad."""
+    """Position of a lane, and extremes so far. Velocities are per p t, angles in rad."""
 
     piece: Int[Array, ""]
     local: Scalar  # time since the start of the piece [s]
     side: Scalar  # corner it stands on: +1, -1; 0 at rest
     opening: Scalar  # side * rotation
     velocity: Scalar  # of the opening
-    uplifting: Flag  # leaves rest now, with zero acceleration (a continuous motion)
+    uplifting: Flag  # leaves rest now with zero acceleration, under a continuous motion
     beyond: Flag  # past the saddle
     extremal: Flag  # the velocity has an extremum here: the acceleration is zero, to rounding
     peak: Scalar
@@ -39,12 +39,12 @@ class State(eqx.Module):
     impact_time: Scalar  # of the last impact [s]
     impact_velocity: Scalar  # of the rotation, just before it
     closeness: Scalar  # smallest squared distance from standing still in balance (`margin`)
-    closeness_beyond: Scalar  # the same since the saddle was last crossed outward
-    clearance: Scalar  # how far from a graze it has been: the least height at which it turned back before the
-    # ground, or depth to which it would have come without the ground where it was being slowed down
-    peak_clearance: Scalar  # the same up to the peak
-    second: Scalar  # the next highest peak
-    spread: Spread  # of opening and velocity
+    closeness_beyond: Scalar  # `closeness` since the last outward crossing of the saddle
+    clearance: Scalar  # smallest distance from a grazing impact [rad]: height of an inward turn above the
+    # ground, or depth that a slowed block would have reached below it
+    peak_clearance: Scalar  # `clearance` up to the peak
+    second: Scalar  # second highest peak
+    spread: Spread  # covariance of the errors of opening and velocity
     overturned: Flag
     done: Flag
     status: Status
@@ -52,7 +52,7 @@ class State(eqx.Module):
 
 
 class Node(eqx.Module):
-    """What a block is followed on from within a step: a few fields of a `State`, of one or of many."""
+    """The fields of a `State`, or of many, from which a block is followed within a step."""
 
     piece: Int[Array, "..."]
     local: Inexact[Array, "..."]
@@ -64,12 +64,12 @@ class Node(eqx.Module):
 
     @classmethod
     def of(cls, state: "State | Node") -> "Node":
-        """Those of a state."""
+        """Copy the fields from a state."""
         return cls(*(getattr(state, field.name) for field in fields(cls)))
 
 
 class Kept(eqx.Module):
-    """What a history keeps of the `State` at the start of every step."""
+    """The fields of the `State` at the start of a step that a history stores."""
 
     start: Node
     impacts: Int[Array, "..."]
@@ -78,53 +78,53 @@ class Kept(eqx.Module):
 
     @classmethod
     def of(cls, state: State) -> "Kept":
-        """That of a state."""
+        """Copy the fields from a state."""
         return cls(Node.of(state), state.impacts, state.impact_time, state.impact_velocity)
 
     @property
     def done(self) -> Bool[Array, "..."]:
-        """Whether it is the last."""
+        """Return whether this is the last state."""
         return self.start.done
 
 
-ROUNDING = 4096  # units of rounding that peaks of one height may be apart
-# What depends on a block's numbers once it has rocked.
+ROUNDING = 4096  # units of rounding within which peaks count as equally high
+# Fields that depend on the parameters of a block once it has rocked.
 _MOVES = (
     "local", "opening", "velocity", "peak", "peak_time", "fastest", "impact_time", "impact_velocity", "closeness",
     "closeness_beyond", "clearance", "peak_clearance", "second",
 )  # fmt: skip
-_MOST = 1e30  # [g], [rad/s], [s]
+_MOST = 1e30  # [g], [rad/s], [s]: larger inputs are rejected
 
 
 def initial_state(scene: Scene, rotation: Scalar, velocity: Scalar) -> State:
-    """State at time 0 from rotation [rad] and angular velocity [rad/s]."""
+    """Return the state at time 0 from rotation [rad] and angular velocity [rad/s]."""
     velocity = velocity / scene.p
-    least = float(jnp.finfo(rotation.dtype).tiny) ** 0.5  # below it squares vanish
+    least = float(jnp.finfo(rotation.dtype).tiny) ** 0.5  # squares of smaller numbers underflow
     rotation, velocity = (where(jnp.abs(x) < least, x - fixed(x), x) for x in (rotation, velocity))
     side = where(rotation != 0, jnp.sign(rotation), jnp.sign(velocity))
-    # At rest they move as on side 1, until it shows to which side the block goes (`rest.lift`).
+    # At rest, derivatives are those of side 1, until `rest.lift` knows the side to which the block uplifts.
     opening = with_derivatives_of(jnp.abs(rotation), where(side < 0, -rotation, rotation))
     outward = with_derivatives_of(side * velocity, where(side < 0, -velocity, velocity))
     zero, no = jnp.zeros_like(opening), jnp.zeros_like(opening, bool)
     count = jnp.zeros_like(opening, jnp.int32)
     moments = scene.on(side).moments
     beyond = opening >= moments.saddle
-    # Squared distance from standing still in balance, for a block that starts beyond it.
+    # Squared distance from standing still in balance, for a block that starts past its saddle.
     pull = moments.restoring(Angle.of(opening))
     stillness = (moments.stiffness * outward**2 + pull**2) / moments.restoring_at_rest**2
-    # A block that the motion cannot lift stays as far from overturning as the motion from lifting it.
+    # For a block that the motion cannot lift, the margin is the distance of the motion from lifting it.
     unlifted = jnp.maximum(2 - scene.outlook.strongest_drive / scene.threshold, 1)
     eps = jnp.finfo(opening.dtype).eps
     finite = jnp.isfinite(rotation) & jnp.isfinite(velocity)
-    # A block whose threshold is not a number would seem to stand for ever; numbers beyond any physics (NaN, too) are
-    # not followed to where squares of them overflow.
+    # With a NaN threshold, a block would seem to stand for ever. The comparison rejects NaN, and numbers so large that
+    # their squares overflow.
     finite = finite & (scene.threshold + scene.p + scene.outlook.strongest_drive + scene.knots[-1] < _MOST)
-    # What a constructor refuses a step of an optimiser may have made of a block or a motion.
+    # A step of an optimiser may leave the ranges that constructors check.
     forward = scene.motion.lasting.forward if scene.first is None else scene.motion.length(scene.first) >= 0
     forward = forward & (scene.knots[0] >= 0) & (scene.knots[-1] >= 0)
     finite = finite & (scene.threshold > 0) & (scene.p > 0) & forward
     spread = Spread.none(opening).plus(eps * opening, eps * outward)
-    if scene.motion.lateness is not None:  # a push that comes too late: at first a velocity that is missing
+    if scene.motion.lateness is not None:  # a push that comes too late: at first the velocity lacks its impulse
         spread = spread.plus(0.0, scene.outlook.strongest_drive * scene.p * scene.motion.lateness)
     return State(
         piece=count if scene.first is None else scene.first,
@@ -156,9 +156,11 @@ def initial_state(scene: Scene, rotation: Scalar, velocity: Scalar) -> State:
 
 
 def all_moving(state: State, scene: Scene) -> State:
-    """The state; where any number of the scene moves, so does all that moves later. Or else JAX would trace the loop
-    over all steps twice when it differentiates it: as what moves at first has it, and as what comes to move on the
-    way."""
+    """Return the state; if any parameter of the scene has a tangent, so have all fields that will depend on it.
+
+    Otherwise JAX traces the loop over all steps twice to differentiate it: with the tangents at entry, then with those
+    that the first step adds.
+    """
     path = [getattr(state, name) for name in _MOVES]
     numbers = [x for x in jax.tree.leaves(scene) if not jnp.shape(x)]
     return replace(state, **dict(zip(_MOVES, given(_all_move, path, (path, numbers)))))
@@ -169,11 +171,11 @@ def _all_move(values: list, _, changes: tuple) -> list:
     moving = [d for d in (*own, *numbers) if not is_zero(d) and jnp.issubdtype(d.dtype, jnp.inexact)]
     if not moving:
         return own
-    # Zeros that differ from lane to lane, if changes do, under `jax.vmap` over directions.
+    # `where` makes zeros that vary between lanes under `jax.vmap` over directions, if the tangents do.
     none = where(jnp.zeros((), bool), moving[0], 0.0).astype(values[0].dtype)
     return [none if is_zero(d) else d for d in own]
 
 
 def surpasses(value: Scalar, best: Scalar) -> Flag:
-    """Whether a peak is higher than the best so far, beyond rounding: of equal peaks the first is timed."""
+    """Return whether a peak exceeds the best so far by more than rounding: of equal peaks the first sets the time."""
     return value > best * (1 + ROUNDING * jnp.finfo(best.dtype).eps)

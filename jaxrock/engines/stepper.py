@@ -1,8 +1,7 @@
-"""What every engine is: settings, and the same at work on one scene.
+"""The interface of an engine: its settings, and a stepper that applies them to one scene.
 
-An engine brings its own way to follow a rocking block from event to event (`advance`), to tell what follows after
-the motion (`finish`), and to evaluate a history (`evaluate`). What all do alike is in the modules beside this one:
-`rest`, `impact`, `bookkeeping`.
+An engine supplies `advance`, which follows a rocking block from event to event; `finish`, which solves the free stage;
+and `evaluate`, which reads a history. The steps that all engines share are in `rest`, `impact` and `bookkeeping`.
 """
 
 import abc
@@ -29,22 +28,24 @@ class AbstractEngine(eqx.Module):
 
     @property
     def reverse(self) -> bool:
-        """Whether reverse mode goes through this engine's own loops."""
+        """Return whether reverse mode goes through this engine's own loops."""
         return False
 
     @property
     def in_lanes(self) -> bool:
-        """Whether its steps consist of what machine code can do."""
+        """Return whether machine code can run its steps."""
         return False
 
     @abc.abstractmethod
     def stepper(self, scene: Scene, stop: Scalar | None, history: bool, taped: bool = False) -> "AbstractStepper":
-        """This engine at work on a scene, up to the time `stop` [s] (None: the end of the motion); `taped`: so that
-        reverse mode goes through its steps."""
+        """Return the stepper of a scene, up to the time `stop` [s] (None: the end of the motion).
+
+        With `taped`, reverse mode goes through its steps.
+        """
 
     @abc.abstractmethod
     def budget(self, scene: Scene, history: bool) -> int:
-        """Largest number of steps."""
+        """Return the largest number of steps."""
 
     @abc.abstractmethod
     def loop(self, unfinished: Callable, step: Callable, carry: PyTree, budget: int) -> PyTree:
@@ -54,7 +55,7 @@ class AbstractEngine(eqx.Module):
 class AbstractStepper(eqx.Module):
     """One scene with an engine's settings, and how far to follow it."""
 
-    if TYPE_CHECKING:  # which would make them arguments of every subclass, in this order
+    if TYPE_CHECKING:  # annotations here would make them arguments of every subclass, in this order
 
         @property
         def scene(self) -> Scene: ...
@@ -71,39 +72,40 @@ class AbstractStepper(eqx.Module):
         stop: AbstractVar[Scalar | None]  # time at which to stop [s]; None: at the end of the motion
         engine: AbstractVar[AbstractEngine]
         history: AbstractVar[bool]  # follow an overturning block down to the ground
-        doubt: AbstractVar[float]  # standard errors from the boundary within which a verdict is not given
+        doubt: AbstractVar[float]  # standard errors from the boundary within which no verdict is given
 
     @abc.abstractmethod
     def advance(self, state: State) -> State:
-        """The state at the next event or step."""
+        """Return the state at the next event or step."""
 
     def to_the_end(self, state: State) -> State:
-        """A state at time 0, brought to the end of the motion, or to where the block is lost."""
+        """Advance a state at time 0 to the end of the motion, or until the block is lost."""
         budget = self.engine.budget(self.scene, history=False)
         return self.engine.loop(lambda s: ~s.done & (s.steps < budget), lambda s: self.advance(s), state, budget)
 
     @abc.abstractmethod
     def finish(self, state: State) -> State:
-        """A state at the end of the motion, brought to the end of the free stage: peak, verdict and margin."""
+        """Advance a state from the end of the motion to the end of the free stage: peak, verdict and margin."""
 
     @abc.abstractmethod
     def evaluate(self, node: Node, elapsed: Scalar) -> tuple[Scalar, Scalar]:
-        """Opening angle [rad] and its velocity [rad/s], `elapsed` seconds after a node and before the next."""
+        """Return the opening angle [rad] and its velocity [rad/s], `elapsed` seconds after a node and before the next.
+        Return the opening angle [rad] and its velocity [rad/s], `elapsed` seconds after a node and before the next."""
 
     def on(self: Stepper, side: Scalar) -> Stepper:
-        """The same for a block that stands on this side."""
+        """Return the stepper for a block that stands on this side."""
         if self.scene.far is None:
             return self
         return replace(self, scene=self.scene.on(side))  # type: ignore[call-arg]  # a field of all that are no base
 
     def time(self, state: State | Node) -> Scalar:
-        """Time of a state [s]."""
+        """Return the time of a state [s]."""
         return self.scene.start(state.piece) + state.local
 
     def room(self, state: State) -> Scalar:
-        """Time to the next knot or the stop [s]."""
-        # Of ties `jnp.minimum` and `jnp.maximum` would take half of both derivatives. No room has derivatives, too: of
-        # two knots that come together one may go.
+        """Return the time to the next knot or the stop [s]."""
+        # In a tie, `jnp.minimum` and `jnp.maximum` would average both derivatives. A zero room has derivatives, too:
+        # one of two coinciding knots may move.
         room = self._to_knot(state)
         if self.stop is not None:
             left = self.stop - self.time(state)
@@ -114,17 +116,18 @@ class AbstractStepper(eqx.Module):
         return self.scene.length(state.piece) - state.local
 
     def _is_over_by(self, stop: Scalar, piece: Int[Array, ""]) -> Flag:
-        """Whether a piece is over before the stop, or then: a duration that is computed may round to either side."""
+        """Return whether a piece ends before the stop or with it: a computed duration may round to either side."""
         following = where(piece < self.scene.pieces, self.scene.start(piece + 1), jnp.inf)
         return following <= stop * (1 + 8 * float(jnp.finfo(following.dtype).eps))
 
     def move_on(self, state: State, elapsed: Scalar, full: Flag) -> tuple[Int[Array, ""], Scalar, Flag]:
-        """Piece and local time after `elapsed` seconds (`full`: up to the knot or the stop), and whether it is over."""
+        """Return piece and local time after `elapsed` seconds (`full`: up to the knot or the stop), and whether the
+        motion is over."""
         ends = full if self.stop is None else full & self._is_over_by(self.stop, state.piece)
         piece = state.piece + ends
         if (
             self.scene.following is not None and not self.history
-        ):  # which tells as many steps with derivatives as without
+        ):  # a history takes as many steps with derivatives as without
             piece = where(ends, self.scene.from_here(piece), piece)
         over = piece >= self.scene.pieces if self.stop is None else full & ~ends
         return piece, where(ends, 0.0, state.local + elapsed), over

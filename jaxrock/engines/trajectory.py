@@ -1,4 +1,4 @@
-"""The steps of a history: where each starts, so that the block can be followed again to any time after it."""
+"""The steps of a history: the start of each, from which the block can be followed again to any later time."""
 
 import functools
 from collections.abc import Callable
@@ -20,11 +20,11 @@ from jaxrock.transforms.differentiation import differentiable
 class Trajectory(eqx.Module):
     """The steps of one history.
 
-    - `stepper`: what follows the block.
-    - `nodes`: every step's start, one axis more; past the last the times are infinite.
-    - `times`: theirs [s].
-    - `impacted`: which of them an impact made.
-    - `duration`: of the history [s].
+    - `stepper`: the stepper that follows the block.
+    - `nodes`: the start of every step, along a leading axis; times past the last are infinite.
+    - `times`: times of the nodes [s].
+    - `impacted`: whether an impact made the node.
+    - `duration`: duration of the history [s].
     """
 
     stepper: Any
@@ -39,50 +39,50 @@ class Trajectory(eqx.Module):
             raise ValueError("This response holds many scenes: call it, and read its events, inside jax.vmap.")
 
     def checked(self, time: Values) -> Inexact[Array, "..."]:
-        """Times within the history."""
+        """Check that times lie within the history, and return them in its precision."""
         self.check_single()
         rounding = max(1e-12, 4 * float(jnp.finfo(self.duration.dtype).eps))
         end = if_traced(self.duration) * (1 + rounding)  # a time computed as the duration may round past it
-        allowed = "be in the history [0, duration]"  # of one that is none (`throw=False`) any time, which tells nothing
+        allowed = "be in the history [0, duration]"  # NaN (`throw=False`) allows any time, which yields NaN
         time = checked("time", time, allowed, lambda t: (t >= 0) & ~(t > end))
         return time.astype(jnp.result_type(time, self.duration))
 
     def equally_spaced(self, samples: int) -> Inexact[Array, " samples"]:
-        """So many times from 0 to the duration, equal to the bit within `jax.jit` and outside."""
+        """Return `samples` times from 0 to the duration, bitwise equal within `jax.jit` and outside."""
         shares = np.linspace(0, 1, samples).astype(self.duration.dtype)
         return placed(np.asarray(self.duration) * shares) if is_at_hand(self.duration) else self.duration * shares
 
     def before(
         self, time: Inexact[Array | np.ndarray, "..."], nodes: PyTree
     ) -> tuple[PyTree, Inexact[Array | np.ndarray, " n"]]:
-        """What `nodes` (all, or what is read of them) tell of the one before each time, in a row, and how long after it
-        that is [s]; not a number where no step was left for that.
+        """Return the leaves of `nodes` at the last node before each time, flattened, and the time since it [s].
 
-        By NumPy where all is at hand: XLA would compile a program, which takes much longer than to look.
+        The elapsed time is NaN where the step budget ended before that time. For concrete values NumPy does the lookup:
+        XLA would compile a program, which takes much longer than the lookup.
         """
         given = nodes, self.nodes.done, self.times, self.duration, time
         return _before(np, *jax.tree.map(np.asarray, given)) if is_at_hand(given) else _before(jnp, *given)
 
     def events(self, told: Callable) -> tuple:
-        """Values at the nodes where something happened, in order; under jit filled up: infinite times, zeros beside
-        them.
+        """Return values at the nodes where an event happened, in order. Under jit they are padded: infinite times,
+        zeros beside them.
 
-        `told(xp, trajectory)`: of every node, by NumPy or JAX, whether it did, what they are ordered by, and pairs of a
-        value and what fills it up.
+        `told(xp, trajectory)` runs under NumPy or JAX. It returns, for every node, whether the event happened, the key
+        that orders the events, and pairs of a value and its padding.
         """
         self.check_single()
-        if is_at_hand(self):  # XLA would compile a program, which takes much longer than to look
+        if is_at_hand(self):  # XLA would compile a program, which takes much longer than the lookup
             happened, order, *values = told(np, jax.tree.map(np.asarray, self))
             order = np.flatnonzero(happened)[np.argsort(order[happened], stable=True)]
             return tuple(placed(np.asarray(value)[order]) for value, _ in values)
         found, count = _in_order(self, told)
         if is_traced(count):
             return found
-        return tuple(value[: int(count)] for value in found)  # known events, of which something moves
+        return tuple(value[: int(count)] for value in found)  # concrete events, some values traced
 
 
 def _before(xp: Any, nodes: PyTree, done: Any, times: Any, duration: Any, time: Any) -> tuple[PyTree, Any]:
-    """The same by NumPy or JAX."""
+    """Do the work of `Trajectory.before` under NumPy or JAX."""
     last = times.size - 1
 
     def at(index):
@@ -101,8 +101,10 @@ def _before(xp: Any, nodes: PyTree, done: Any, times: Any, duration: Any, time: 
 def at_times(
     follow: Callable, node: PyTree, elapsed: Any, duration: Inexact[Array, ""], shape: tuple[int, ...]
 ) -> PyTree:
-    """`follow(node, elapsed)` of all that `before` has found; the results have the shape of the times in front. Of a
-    history that is none, not numbers."""
+    """Map `follow(node, elapsed)` over the results of `Trajectory.before`. The shape of the times leads in the results.
+
+    A history that was not computed (NaN duration) yields NaN.
+    """
     found = jax.vmap(follow)(node, elapsed)
     return still_where(jnp.isnan(duration), jax.tree.map(lambda x: x.reshape(*shape, *x.shape[1:]), found))
 
@@ -118,7 +120,7 @@ def _in_order(path: Trajectory, told: Callable) -> tuple[tuple, Int[Array, ""]]:
     return tuple(found), happened.sum()
 
 
-_STRIDE = 8  # steps at a time of machine code, where one alone takes less than keeping it
+_STRIDE = 8  # steps per call of machine code, where storing one state takes longer than computing it
 
 
 def _whole(state: PyTree) -> PyTree:
@@ -132,10 +134,11 @@ def states_of(
     limit: int | Int[Array, ""] | None = None,
     keep: Callable[[PyTree], PyTree] = _whole,
 ) -> tuple[PyTree, PyTree]:
-    """Follow a block to the end, or until it has taken `limit` steps in all: the last state, and `keep(state)` of every
-    state by the number of steps from the first; after the last it may stand again, or zeros.
+    """Follow a block to the end, or until it has taken `limit` steps in all.
 
-    There is room for so many steps, which are the limit if none is told. `keep` is a function of a module.
+    Return the last state, and `keep(state)` of every state by the number of steps from the first. Rows after the last
+    hold it again, or zeros. `room` is the number of steps for which there are rows, and the default of `limit`. `keep`
+    is a function of a module.
     """
     engine, limit = stepper.engine, room if limit is None else limit
     if not engine.in_lanes:
@@ -156,7 +159,7 @@ def states_of(
 
 
 def rows_of(engine: Any, budget: int) -> int:
-    """For how many states there is room."""
+    """Return the number of states for which `states_of` has rows."""
     length = _STRIDE if engine.in_lanes else 1
     return -(-budget // length) * length + 1
 
@@ -164,7 +167,7 @@ def rows_of(engine: Any, budget: int) -> int:
 def followed(advance: Callable, state: PyTree, budget: int, loop: Callable) -> tuple[PyTree, PyTree]:
     """Repeat `advance` until the state is done, at most `budget` times, and keep all states, as `states_of`.
 
-    `loop(unfinished, step, carry, budget)` repeats.
+    `loop(unfinished, step, carry, budget)` is the loop primitive.
     """
     return _in_strides(lambda s: _stride(advance, s, budget, 1, _whole), state, budget, loop, budget, _whole)
 
@@ -183,16 +186,16 @@ def _in_strides(
     def step(carry):
         turn, state, nodes = carry
         state, rows = stride(state)
-        place = (turn * length + 1).astype(jnp.uint32)  # of integers with a sign each leaf would ask which it has
+        place = (turn * length + 1).astype(jnp.uint32)  # a signed index would cost each leaf a test of its sign
         return turn + 1, state, _with_rows(nodes, rows, place)
 
-    # At a place that it knows XLA would make of zeros and a row a program for each leaf, which pads; of
-    # `zeros.at[0].set` a loop. It does not know that no steps are negative.
+    # With a constant index, XLA compiles one padding program per leaf; `zeros.at[0].set` becomes a loop. XLA cannot
+    # know that `steps` is never negative, so `first` is no constant.
     rows, first = jax.tree.map(lambda x: x[None], keep(state)), (state.steps < 0).astype(jnp.uint32)
     zeros = jax.tree.map(lambda x: jnp.zeros((most * length + 1, *x.shape[1:]), x.dtype), rows)
     nodes = _with_rows(zeros, rows, first)
-    # Under `jax.vmap` a condition of each lane would have JAX copy all that is kept at every step: lanes that are done
-    # wait, and keep their last state once more.
+    # Under `jax.vmap` a condition of each lane makes JAX copy all rows at every step. With one condition for all lanes,
+    # lanes that are done wait, and store their last state again.
     _, state, nodes = loop(
         lambda carry: unvmap_any(_unfinished(carry[1], limit)), step, (jnp.int32(0), state, nodes), most
     )
@@ -210,8 +213,8 @@ def _unfinished(state: PyTree, limit: int | Int[Array, ""]) -> Bool[Array, ""]:
 def _stride(
     advance: Callable, state: PyTree, limit: int | Int[Array, ""], length: int, keep: Callable
 ) -> tuple[PyTree, PyTree]:
-    """The state after so many steps, and what is kept of it after each of them; one that is done, or has taken `limit`
-    in all, waits."""
+    """Return the state after `length` steps, and `keep` of the state after each of them. A state that is done, or has
+    taken `limit` steps in all, waits."""
 
     def step(state):
         going, after = _unfinished(state, limit), advance(state)
@@ -220,7 +223,7 @@ def _stride(
     def one_more(carry):
         left, state, kept = carry
         state = step(state)
-        # The rows move up: at places of its own each would be a choice among all.
+        # The rows move up: a write at a varying index is a select among all rows.
         return left - 1, state, jax.tree.map(lambda rows, x: jnp.concatenate([rows[1:], x[None]]), kept, keep(state))
 
     if length == 1:
@@ -231,5 +234,5 @@ def _stride(
 
 
 def times_of(time: Callable, nodes: PyTree, steps: Int[Array, ""]) -> Inexact[Array, " nodes"]:
-    """Times of the nodes up to the last state, which is after so many steps; infinite past it."""
+    """Return the times of the nodes up to the last state, after `steps` steps; infinite past it."""
     return where(jnp.arange(nodes.done.size) <= steps, jax.vmap(time)(nodes), jnp.inf)

@@ -1,8 +1,10 @@
-"""How far a computed state may be off: the covariance of its errors, carried along to first order.
+"""The error of a computed state: its covariance, propagated to first order.
 
-Every step adds what it may get wrong; the flow between impacts stretches what is there, as x'' = repulsion x
-stretches small differences; an impact mixes it, because an error in height is an error in time (the saltation
-matrix). The estimate costs a few per cent of a step, and tells apart a verdict from a toss-up.
+Every step adds its own error. The flow between impacts amplifies the accumulated error, as x'' = repulsion x amplifies
+small differences. An impact mixes its components, because an error in height is an error in time (the saltation
+matrix).
+
+The estimate costs a few per cent of a step, and tells apart a verdict from a toss-up.
 """
 
 import math
@@ -17,7 +19,7 @@ from jaxrock.numerics.polynomial import horner
 
 Scalar = Inexact[Array, ""]
 
-# Of cosh(x) and sinh(x)/x in x^2, to 2e-7 up to here: an error is estimated, without divisions.
+# Series of cosh(x) and sinh(x)/x in x^2, without divisions; up to here accurate to 2e-7, enough for an error estimate.
 _NEAR = 4.0
 _COSH = tuple(1 / math.factorial(2 * k) for k in range(7))
 _SINH_RATIO = tuple(1 / math.factorial(2 * k + 1) for k in range(7))
@@ -35,13 +37,13 @@ class Spread(eqx.Module):
 
     @classmethod
     def none(cls, like: Scalar) -> "Spread":
-        """No error at all."""
+        """Return zero errors."""
         zero = jnp.zeros_like(like)
         return cls(zero, zero, zero)
 
     @classmethod
     def where(cls, condition: Bool[Array, ""], one: "Spread", other: "Spread") -> "Spread":
-        """`one` where the condition holds, else `other`."""
+        """Select `one` where the condition holds, else `other`."""
         return cls(*(where(condition, a, b) for a, b in zip(one._parts, other._parts)))
 
     @property
@@ -50,20 +52,20 @@ class Spread(eqx.Module):
 
     @property
     def angle(self) -> Scalar:
-        """Standard error of the opening angle [rad]."""
+        """Return the standard error of the opening angle [rad]."""
         return jnp.sqrt(jnp.maximum(self.xx, 0.0))
 
     @property
     def square(self) -> Scalar:
-        """The squared standard error of angle and velocity together [rad^2]."""
+        """Return the squared standard error of angle and velocity together [rad^2]."""
         return self.xx + self.vv
 
     def error_of(self, of_angle: Scalar | float, of_velocity: Scalar | float) -> Scalar:
-        """Standard error of a quantity with these derivatives."""
+        """Return the standard error of a quantity with these derivatives."""
         return jnp.sqrt(self.variance(of_angle, of_velocity))
 
     def variance(self, of_angle: Scalar | float, of_velocity: Scalar | float) -> Scalar:
-        """Its square."""
+        """Return the variance of a quantity with these derivatives."""
         variance = of_angle**2 * self.xx + 2 * of_angle * of_velocity * self.xv + of_velocity**2 * self.vv
         return jnp.maximum(variance, 0.0)
 
@@ -76,7 +78,7 @@ class Spread(eqx.Module):
         return Spread(self.xx + angle, self.xv, self.vv + velocity)
 
     def _through(self, a: Scalar, b: Scalar | float, c: Scalar, d: Scalar) -> "Spread":
-        """M S M' with M = [[a, b], [c, d]]."""
+        """Return M S M' with M = [[a, b], [c, d]]."""
         return Spread(
             a * a * self.xx + 2 * a * b * self.xv + b * b * self.vv,
             a * c * self.xx + (a * d + b * c) * self.xv + b * d * self.vv,
@@ -84,8 +86,8 @@ class Spread(eqx.Module):
         )
 
     def after_flow(self, repulsion: Scalar, time: Scalar) -> "Spread":
-        """Errors after a time (p t) under x'' = repulsion x; an attraction is taken as none."""
-        pull = jnp.maximum(repulsion, 1e-12)  # for arcs without an end, too
+        """Return the errors after a time (p t) under x'' = repulsion x; an attraction counts as zero."""
+        pull = jnp.maximum(repulsion, 1e-12)  # positive for arcs of infinite length, too
         square = pull * time**2
 
         def far():
@@ -99,12 +101,13 @@ class Spread(eqx.Module):
         return self._through(even, odd, pull * odd, even)
 
     def after_impact(self, speed: Scalar, before: Scalar, after: Scalar, ratio: Scalar, slope: Scalar) -> "Spread":
-        """Errors after an impact at `speed` < 0, with the opening's accelerations before and after it.
+        """Return the errors after an impact at `speed` < 0, with the opening's accelerations before and after it.
 
-        `ratio`: of the speeds after and before, e; `slope`: of the one by the other, e'. The saltation matrix
-        [[e, 0], [-(after + e' before)/speed, e']]. An impact so gentle that it may not happen
-        at all is as uncertain as a fall through the error of the angle; one that an outward acceleration may have
-        prevented is as uncertain as its own change of velocity.
+        `ratio`: e, the speed after the impact over the speed before; `slope`: e', the derivative of the one by the
+        other. The saltation matrix is [[e, 0], [-(after + e' before)/speed, e']].
+
+        An impact so gentle that it may not happen is as uncertain as a fall through the error of the angle. An impact
+        that an outward acceleration may have prevented is as uncertain as its own change of velocity.
         """
         kick = -(after + slope * before)
         fall = kick**2 * self.xx  # the fourth power of the speed of such a fall

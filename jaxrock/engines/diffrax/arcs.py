@@ -1,13 +1,11 @@
 """The diffrax engine: one `diffrax.diffeqsolve` for each smooth arc of a rocking block.
 
-An arc runs from one event to the next: impact, turning point, velocity extremum, saddle crossing, certain loss, an
-angle at which the moments bend, a knot of the motion. All events are roots of one function, the smallest of a few
-guards that are positive at first.
+An arc ends with an impact, turning point, velocity extremum, saddle crossing, certain loss, an angle at which the
+moments bend, or a knot. All events are roots of one function, the smallest of a few guards that start positive.
 
-A guard may start at zero, as the opening angle after an impact and the velocity after a turning point do. It is divided
-by the power of time with which it leaves zero: a hop of any size is seen, and its start is no event. The signs of
-velocity and acceleration are guards too. A dip through the ground inside one step cannot hide, because it needs a
-turning point.
+A guard may start at zero, as the opening angle after an impact and the velocity after a turning point do. Division by
+the power of time with which it leaves zero finds a hop of any size. Velocity and acceleration are guarded, too: a dip
+through the ground inside one step cannot hide, because it needs a turning point.
 
 Knots and bends end arcs, so that the right-hand side of every solve is smooth. A step across a jump of its derivative
 keeps values within the tolerance, but not slopes.
@@ -70,8 +68,8 @@ class Diffrax(AbstractEngine):
     **Arguments:**
 
     - `solver`: any diffrax solver of ordinary differential equations.
-    - `rtol`: tolerance of a step relative to the state, in (0, 1); 1e-12 is about the tightest in double precision,
-      2e-6 in single, where less is taken for that.
+    - `rtol`: tolerance of a step relative to the state, in (0, 1). The tightest is about 1e-12 in double precision
+      and 2e-6 in single, which replaces smaller values.
     - `atol`: absolute tolerance over alpha; None takes 1e-8 rtol, so that small hops keep their digits. For solvers of
       low order, whose steps that makes very short, give some 1e-2 rtol.
     - `controller`: a step-size controller instead of the PID controller with these tolerances; `rtol` then is
@@ -130,16 +128,16 @@ class Diffrax(AbstractEngine):
 
     @property
     def reverse(self) -> bool:
-        """Whether reverse mode goes through this engine's own loops: as the adjoint tells."""
+        """Return whether reverse mode goes through this engine's own loops: with every adjoint but `ForwardMode`."""
         return not isinstance(self.adjoint, diffrax.ForwardMode)
 
     @property
     def in_lanes(self) -> bool:
-        """Machine code follows an arc's solve unless reverse mode goes through it."""
+        """Return whether machine code runs the solve of an arc: unless reverse mode goes through it."""
         return not self.reverse
 
     def stepper(self, scene: Scene, stop: Scalar | None, history: bool, taped: bool = False) -> "ArcStepper":
-        """This engine at work on a scene."""
+        """Return the stepper of a scene."""
         if taped:
             raise ValueError(
                 "Derivatives by so many numbers need reverse mode: use Series(), or "
@@ -148,34 +146,35 @@ class Diffrax(AbstractEngine):
         return ArcStepper(scene=scene, stop=stop, history=history, engine=self)
 
     def budget(self, scene: Scene, history: bool) -> int:
-        """Largest number of solves."""
+        """Return the largest number of solves."""
         usual = POLICY.solves + 4 * scene.most_pieces
         # Between impacts there are about four arcs, plus two passes of each bend; a history stores every arc, so its
         # bound is lower.
         return self.max_solves or usual + scene.moments.bends * (64 if history else usual // 2)
 
     def loop(self, unfinished: Callable, step: Callable, carry: PyTree, budget: int) -> PyTree:
-        """A loop that goes with the adjoint."""
+        """Run a loop that the adjoint supports."""
         return eqxi.while_loop(unfinished, step, carry, max_steps=budget, kind=_ADJOINTS[type(self.adjoint)])
 
     def within(self, dtype) -> tuple[float, float]:
-        """The relative tolerance, and the least absolute one over alpha, that this precision allows: in single
-        precision what rounding leaves of a step is more than the usual ones."""
+        """Return the relative tolerance, and the least absolute one over alpha, that this precision allows. In single
+        precision the rounding of a step exceeds the usual ones."""
         eps = float(jnp.finfo(dtype).eps)
         return (max(self.rtol, 16 * eps), 8 * eps) if eps > 1e-10 else (self.rtol, 0.0)
 
     def limits(self, scene: Scene, piece: Int[Array, ""]) -> tuple[Scalar, Scalar]:
-        """Absolute tolerance [rad], and the longest step (p t) in a piece of the motion; without derivatives."""
+        """Return the absolute tolerance [rad], and the longest step (p t) in a piece of the motion; without
+        derivatives."""
         rtol, least = self.within(scene.p.dtype)
         atol = max(self.atol or 1e-8 * rtol, least) * scene.alpha
         # A fraction of the time in which the forcing changes: a step sees at most one turn of it.
         return jax.lax.stop_gradient((atol, jnp.minimum(POLICY.longest, scene.p * scene.scale(piece))))
 
     def solve(self, arc: Arc, limits: tuple[Scalar, Scalar], length: Scalar, event: diffrax.Event | None) -> Any:
-        """The arc, for `length` (p t) at most."""
+        """Solve the arc, for `length` (p t) at most."""
         length = jnp.where(arc.side != 0, length, 0.0)
-        # Where it is longer than the arc, diffrax cuts it, and the step ends with the arc; cut here it would only half
-        # do so: of two equal times, derivatives go with each by one half.
+        # The first step is not cut to the length: `minimum` of two equal times halves both derivatives. Diffrax cuts
+        # it, and the step ends with the arc.
         rtol, _ = self.within(arc.opening.dtype)
         first = first_step(arc, rtol)
         first = jax.lax.stop_gradient(jnp.where(first > 0, first, 1.0))
@@ -200,8 +199,8 @@ class Diffrax(AbstractEngine):
         )
 
     def _begun(self, term: diffrax.ODETerm, zero: Scalar, y0: Pair, arc: Arc) -> PyTree:
-        """The solver's state with its first evaluation done, where it takes that from step to step: else its steps
-        would have a stage that only the first of them needs."""
+        """Return a solver state with its first stage evaluated, where the solver reuses the last stage (FSAL).
+        Otherwise every step has a stage that only the first needs."""
         solver = self.solver
         if not isinstance(solver, diffrax.AbstractERK) or solver.init(term, zero, zero, y0, arc) is None:
             return None
@@ -210,11 +209,12 @@ class Diffrax(AbstractEngine):
     def locate(
         self, arc: Arc, limits: tuple[Scalar, Scalar], length: Scalar, event: diffrax.Event
     ) -> tuple[Any, Scalar, Pair]:
-        """The arc up to its event; its end (p t), and opening angle and velocity there, with their derivatives.
+        """Return the solution up to its event; its end (p t), and opening angle and velocity there, with their
+        derivatives.
 
-        Where the event is is found without derivatives; those of the arc are taken at that time, and the time moves by
-        the implicit function. (Optimistix, which does that for diffrax, checks its quotient by calling back to Python,
-        and JAX keeps no program that calls back.)
+        The event is located without derivatives; derivatives of the arc are taken at that time, and the implicit
+        function moves the time. (Optimistix does that for diffrax, but checks its quotient by a host callback, which
+        programs that JAX caches cannot contain.)
         """
         held = jax.tree.map(lambda x: jax.lax.stop_gradient(x) if eqx.is_inexact_array(x) else x, (arc, length))
         solution = self.solve(held[0], limits, held[1], event)
@@ -232,26 +232,26 @@ class Diffrax(AbstractEngine):
 
         def left(time):
             value, slope = jax.jvp(guard, (time,), (jnp.ones_like(time),))
-            clear = jnp.abs(value) < jnp.abs(slope) / jnp.finfo(slope.dtype).eps  # no arc of no length
+            clear = jnp.abs(value) < jnp.abs(slope) / jnp.finfo(slope.dtype).eps  # no arc of zero length
             return jnp.where(clear, value / jnp.where(clear, slope, 1.0), 0.0)
 
-        # Without derivatives they are what was found.
+        # The primal values are those found without derivatives.
         free = length + (end - jax.lax.stop_gradient(length))
         time = with_derivatives_of(end, jnp.where(solution.event_mask, carried(end, left), free))
         return solution, time, with_derivatives_of(y, at(time))
 
 
 class ArcStepper(AbstractStepper):
-    """One scene with the engine's settings, and how far to follow it."""
+    """One scene with the engine's settings, and the time up to which to follow it."""
 
     scene: Scene
     stop: Scalar | None
     history: bool = eqx.field(static=True)
     engine: Diffrax
-    doubt: float = eqx.field(static=True, default=1.0)  # the estimate is generous
+    doubt: float = eqx.field(static=True, default=1.0)  # the error estimate is generous
 
     def advance(self, state: State) -> State:
-        """One arc of a lane, or a wait at rest."""
+        """Advance a lane by one arc, or by a wait at rest."""
         scene = self.scene
         forcing = Forcing.of(scene, state)
         eps = float(jnp.finfo(scene.p.dtype).eps)
@@ -270,9 +270,8 @@ class ArcStepper(AbstractStepper):
         return replace(after, done=after.done | turned | (after.status != Status.successful))
 
     def _outdone(self, state: State) -> Flag:
-        """Whether an asymmetric block that turns back in the free stage will neither fall on the other side, nor come
-        higher or closer to its balance there than before: its energy would not take it to some angle below all that.
-        """
+        """Return whether an asymmetric block that has turned back can neither fall on the other side, nor come higher
+        or closer to balance there. Its energy is too small to reach some angle below all that."""
         scene = self.scene.on(state.side)
         far, whole = scene.both_moments[1], scene.moments.work(state.opening)
         left = scene.reset.most(jnp.sqrt(2 * whole)) ** 2 * whole
@@ -293,7 +292,7 @@ class ArcStepper(AbstractStepper):
         return stepper.to_the_end(state)
 
     def to_the_end(self, state: State) -> State:
-        """Through the free stage, too, whose impacts count if the block is lost after them."""
+        """Advance through the free stage, too; impacts there count only if the block overturns after them."""
         budget, pieces = self.engine.budget(self.scene, history=False), self.scene.pieces
 
         def step(carry):
@@ -317,14 +316,14 @@ class ArcStepper(AbstractStepper):
         run = run if self.engine.reverse else differentiable(run)
         time = self.scene.p * elapsed
         y = run((self.engine, arc, self.engine.limits(self.scene, node.piece), time))
-        # A solve of no length does not move with it.
+        # A solve of zero length has no derivative with respect to its length.
         shift = jnp.where(time == 0, time - jax.lax.stop_gradient(time), 0.0)
         flow, bent = jax.jvp(arc.flow, (time, y), (jnp.ones_like(time), arc.flow(time, y)))
         opening, velocity = y + shift * flow + shift**2 / 2 * bent
         return opening, velocity * self.scene.p
 
     def _rock(self, state: State, forcing: Forcing, rocking: Flag) -> State:
-        """Rocking: an arc up to its event, the knot, or the stop."""
+        """Follow an arc up to its event, the knot, or the stop."""
         scene, engine = self.scene, self.engine
         lost = escaped(self, state, Angle.of(state.opening)) & (not self.history)
         room = jnp.where(rocking & ~lost, self.room(state), 0.0)
@@ -345,7 +344,7 @@ class ArcStepper(AbstractStepper):
         fired = happened & (jnp.arange(guards.size) == jnp.argmin(guards))
         hits = Events(*fired[: len(WATCHED)])
         ground = hits.impact | (happened & (y[0] <= 0) & ~void)
-        # The saddle is where a free block has its slowest passage: two events in one.
+        # At the saddle a free block passes most slowly: two events coincide.
         crossing = hits.saddle | (happened & (arc.gap(y[0]) == 0) & (arc.gap(state.opening) != 0))
         hits = hits._replace(impact=ground & ~void, turning=hits.turning & ~ground, saddle=crossing & ~ground)
 
@@ -369,13 +368,13 @@ class ArcStepper(AbstractStepper):
             beyond=state.beyond ^ hits.saddle,
             fastest=jnp.maximum(state.fastest, jnp.abs(y[1])),
             spread=spread,
-            done=over & self.history,  # an outcome goes on through the free stage
+            done=over & self.history,  # an outcome continues through the free stage
         )
         after = replace(after, side=jnp.where(void, 0.0, after.side))
         return self._happen(state, after, arc, hits, y, lost, solution.result)
 
     def _happen(self, before: State, after: State, arc: Arc, hits: Events, y: Pair, lost: Flag, result) -> State:
-        """Let the event of an arc happen: peaks, margin, impact, verdict."""
+        """Apply the event of an arc: peaks, margin, impact, verdict."""
         scene = self.scene
         outward = (before.velocity > 0) | ((before.velocity == 0) & (arc.start_acceleration >= 0))
         acceleration = arc.acceleration((after.local - before.local) * scene.p, y)
@@ -390,7 +389,7 @@ class ArcStepper(AbstractStepper):
         exhausted = result == diffrax.RESULTS.max_steps_reached
         failed = ~exhausted & ~diffrax.is_okay(result)
         balanced = quiet & (before.velocity == 0) & (jnp.abs(arc.start_acceleration) <= arc.noise) & (before.side != 0)
-        # Fallen flat at next to no speed: it may have turned back just before.
+        # A block that falls flat at nearly zero speed may have turned back just before.
         barely = scene.falls_flat & down & ~gone
         barely = barely & (y[1] ** 2 <= 2 * self.doubt * jnp.abs(acceleration) * after.spread.angle)
         status = Status.where(balanced | barely, Status.undecided, after.status)

@@ -25,12 +25,13 @@ Pair = Inexact[Array, "2"]  # opening angle, velocity per p t
 
 
 class Policy(NamedTuple):
-    """How the diffrax engine goes about it.
+    """Settings of the diffrax engine that change times, but no result beyond its error.
 
-    - `longest`: step of the default controller [1/p].
-    - `order`: of the motion's series: for waiting, for coming to rest, and of pieces that are polynomials.
-    - `share`: usual steps in one solve: a longer arc goes on in the next, so that the lanes of a batch keep pace.
-    - `solve_steps`: step budget of one solve; `solves`: of a scene, besides four for each piece of the motion.
+    - `longest`: longest step of the default controller [1/p].
+    - `order`: order of the motion's series, for waits, for coming to rest, and for pieces that are polynomials.
+    - `share`: usual steps in one solve; a longer arc continues in the next, so that the lanes of a batch keep pace.
+    - `solve_steps`: step budget of one solve.
+    - `solves`: budget of solves of a scene, besides four for each piece of the motion.
     """
 
     longest: float = 0.5
@@ -41,14 +42,16 @@ class Policy(NamedTuple):
 
 
 POLICY = Policy()
-_NOISE = 64  # units of rounding that an acceleration may be off by
+_NOISE = 64  # error of an acceleration, in units of rounding
 
 
 class Forcing(eqx.Module):
-    """The ground's acceleration [g] along an arc. A piece that is a polynomial (of a record) is taken as that, so that
-    a right-hand side does not look into the record."""
+    """The ground acceleration [g] along an arc.
 
-    motion: AbstractMotion | None  # None: the terms are all
+    A polynomial piece (of a record) is stored as its terms, so that the right-hand side does not look into the record.
+    """
+
+    motion: AbstractMotion | None  # None: the terms are exact
     shaking: Shaking  # Taylor coefficients in time/unit
     unit: Scalar  # [s]
     piece: Int[Array, ""]
@@ -58,7 +61,7 @@ class Forcing(eqx.Module):
 
     @classmethod
     def of(cls, scene: Scene, state: State | Node) -> "Forcing":
-        """The forcing from a state on."""
+        """Build the forcing from a state on."""
         shaking, unit = scene.shaking(state.piece, state.local, POLICY.order)
         piece = jnp.minimum(state.piece, scene.pieces - 1)
         polynomial = all(terms is None or len(terms) <= POLICY.order for terms in shaking)
@@ -66,7 +69,7 @@ class Forcing(eqx.Module):
         return cls(motion, shaking, unit, piece, state.local, state.piece < scene.pieces, scene.p)
 
     def __call__(self, time: Scalar) -> tuple[Scalar, Scalar | None]:
-        """Acceleration [g] and weight (`Shaking.at`) at p t since the state."""
+        """Return the acceleration [g] and weight (`Shaking.at`) at p t since the state."""
         if self.motion is None:
             return self.shaking.at(time / (self.p * self.unit))
         here = self.piece, self.local + time / self.p, 1 / self.p, 0
@@ -75,12 +78,12 @@ class Forcing(eqx.Module):
 
     @property
     def reach(self) -> Scalar:
-        """For how long `steepest` holds [s], within the piece."""
+        """Return the time for which `steepest` holds [s], within the piece."""
         return 0.25 * self.unit
 
     @property
     def steepest(self) -> tuple[Scalar, Scalar | None]:
-        """Bounds of how fast the acceleration changes within `reach`, horizontal and vertical [g/s]."""
+        """Return bounds of how fast the acceleration changes within `reach`, horizontal and vertical [g/s]."""
         return jax.tree.map(lambda rate: rate / self.unit, self.shaking.steepest(0.25))
 
 
@@ -116,15 +119,15 @@ class Arc(eqx.Module):
     velocity: Scalar
     start_acceleration: Scalar  # at the start
     start_jerk: Scalar  # its derivative
-    noise: Scalar  # what rounding may make of an acceleration that is zero
-    helpful: tuple[Scalar, Scalar | None]  # forcing and weight still to come that help it most
-    hop: Flag  # too small for its turning point to matter, and certain to come back
+    noise: Scalar  # error by rounding of an acceleration that is zero
+    helpful: tuple[Scalar, Scalar | None]  # the forcing and weight still to come that help the block most
+    hop: Flag  # certain to come back, with a turning point too small to matter
     flat: Flag  # whether a rotation of pi/2 ends it
     bend: Scalar | None  # next opening angle at which the moments bend; None: they are smooth everywhere
 
     @classmethod
     def of(cls, scene: Scene, start: State | Node, forcing: Forcing, history: bool) -> "Arc":
-        """The arc from a state on."""
+        """Build the arc from a state on."""
         zero, no = jnp.zeros_like(start.opening), jnp.zeros_like(start.opening, bool)
         flat = (start.opening < jnp.pi / 2) & (history or scene.falls_flat)
         state = start.side, start.opening, start.velocity
@@ -132,7 +135,7 @@ class Arc(eqx.Module):
         arc = cls(moments, forcing, *state, zero, zero, zero, scene.outlook.most_helpful(start.piece), no, flat, bend)
         y = jnp.stack([start.opening, start.velocity])
         acceleration, jerk = jax.jvp(arc.acceleration, (zero, y), (zero + 1, arc.flow(zero, y)))
-        # What is zero by continuity, or but for rounding, is zero: its sign would mean nothing.
+        # An acceleration that is zero by continuity, or up to rounding, becomes zero: its sign would be random.
         pull = scene.moments.restoring_at_rest + jnp.abs(forcing(zero)[0]) * scene.moments.arm_at_rest
         noise = _NOISE * jnp.finfo(acceleration.dtype).eps * (pull + jnp.abs(jerk) * scene.p * start.local)
         leaving = (start.opening == 0) & (start.velocity == 0)
@@ -141,31 +144,31 @@ class Arc(eqx.Module):
         return eqx.tree_at(lambda a: (a.start_acceleration, a.start_jerk, a.noise), arc, (acceleration, jerk, noise))
 
     def acceleration(self, time: Scalar, y: Pair) -> Scalar:
-        """Acceleration of the opening angle per (p t)^2."""
+        """Return the acceleration of the opening angle per (p t)^2."""
         acceleration, weight = self.forcing(time)
         return self.moments.acceleration(Angle.of(y[0]), y[1], self.side * acceleration, weight)
 
     def flow(self, time: Scalar, y: Pair) -> Pair:
-        """The right-hand side."""
+        """Return the right-hand side."""
         return jnp.stack([y[1], self.acceleration(time, y)])
 
     def gap(self, opening: Scalar) -> Scalar:
-        """Opening angle beyond the saddle; zero where that is only rounding."""
+        """Return the opening angle beyond the saddle; zero within rounding."""
         gap = opening - self.moments.saddle
         return jnp.where(jnp.abs(gap) <= 64 * jnp.finfo(gap.dtype).eps * self.moments.saddle, 0.0, gap)
 
     @property
     def leaving(self) -> Flag:
-        """Whether the block leaves rest."""
+        """Return whether the block leaves rest."""
         return (self.opening == 0) & (self.velocity == 0)
 
     @property
     def horizon(self) -> Scalar:
-        """Time (p t) for which the acceleration of a block that leaves rest is only noise."""
+        """Return the time (p t) for which rounding dominates the acceleration of a block that leaves rest."""
         return self.noise / jnp.maximum(self.start_jerk, self.noise)
 
     def is_void(self, time: Scalar, y: Pair, event: Flag) -> Flag:
-        """Whether the block leaves rest by no more than rounding: the threshold is touched, not passed."""
+        """Return whether the block leaves rest by no more than rounding: the threshold is touched, not passed."""
         nothing = event & (jnp.abs(y[1]) <= self.noise * time)
         return self.leaving & (self.start_acceleration == 0) & ((self.start_jerk <= 0) | nothing)
 
@@ -173,11 +176,11 @@ class Arc(eqx.Module):
         """Return one guard for every event, in the order of `Events`, then certain loss, then the bend of the moments.
         All start above zero; the first at zero ends the arc."""
         jets = [self.opening, self.velocity, self.start_acceleration, self.start_jerk]  # derivatives at the start
-        # The acceleration has to be past zero by more than rounding, so that no extremum is met twice.
+        # The acceleration must pass zero by more than rounding, so that no extremum fires twice.
         rises = jnp.where(self.start_acceleration == 0, self.start_jerk >= 0, self.start_acceleration > 0)
         most = self.noise / (_NOISE * jnp.finfo(self.noise.dtype).eps)
         directed = jnp.where(rises, 1.0, -1.0) * self.acceleration(time, y) + self.noise
-        # Just beyond the saddle rounding decides the sign of the gap, also where a piece of the moments ends near
+        # Just beyond the saddle, rounding decides the sign of the gap, also where a piece of the moments ends near
         # there.
         beyond = True if self.bend is None else (self.gap(self.opening) != 0) | (self.gap(y[0]) != 0)
         guards = Events(
@@ -191,14 +194,14 @@ class Arc(eqx.Module):
         forced = self.helpful[0] > 0
         if self.helpful[1] is not None:
             forced = forced | (self.helpful[1] != 1)
-        # The arc that ends here leaves a rest that rounding makes: the next must not end at once, and all after it.
+        # An arc that ends here ends a rest within rounding: without the margin the next arcs would end at once, too.
         lost = _guard(time, self._hold(y[0]), [held], forced & (held > self.noise))
         if self.bend is None:
             return jnp.stack([*guards, lost])
         return jnp.stack([*guards, lost, _guard(time, self.bend - y[0], [self.bend - self.opening], True)])
 
     def _hold(self, opening: Scalar) -> Scalar:
-        """What the restoring moment and the most helpful forcing do against overturning."""
+        """Return the deceleration of a block at rest at this angle, under the most helpful forcing."""
         return -self.moments.acceleration(Angle.of(opening), jnp.zeros_like(opening), *self.helpful)
 
 
@@ -213,7 +216,7 @@ def _smooth(moments: AbstractMoments, start: State | Node, forcing: Forcing) -> 
 
 
 def _guard(time: Scalar, value: Scalar, jet: list[Scalar], active: Flag | bool) -> Scalar:
-    """`value` over its leading term c t^m at the start, `jet` = its Taylor coefficients there; one at time 0."""
+    """Divide `value` by its leading term c t^m at the start, with Taylor coefficients `jet`; one at time 0."""
     lead, power = jnp.ones_like(time), jnp.ones_like(time)
     found = jnp.zeros_like(time, bool)
     for m, c in enumerate(jet):
@@ -226,7 +229,7 @@ def _guard(time: Scalar, value: Scalar, jet: list[Scalar], active: Flag | bool) 
 
 
 def field(t, y, args: Arc):
-    """The right-hand side, as diffrax calls it."""
+    """Return the right-hand side, with the signature that diffrax expects."""
     return args.flow(t, y)
 
 
@@ -241,35 +244,38 @@ def field_of_trials(t, y, args: Arc):
 
 
 def first_guard(t, y, args: Arc, **kwargs):
-    """The smallest guard, as diffrax calls it."""
-    # Diffrax sets this beside a zero of the default type, also where the scene is in single precision.
+    """Return the smallest guard, with the signature that diffrax expects."""
+    # Diffrax compares it with a zero of the default type, also where the scene is in single precision.
     return jnp.min(args.guards(t, y)).astype(jnp.result_type(float))
 
 
 def usual_step(rtol: float) -> float:
-    """Step (p t) that methods of order five take at this tolerance."""
+    """Return the step (p t) that methods of order five take at this tolerance."""
     return min(0.1 * (rtol / 1e-8) ** 0.2, POLICY.longest)
 
 
 class StepControl(diffrax.PIDController):
-    """A controller that knows its first step. Diffrax would check one that it is given by calling back to Python, and
-    what calls back cannot be kept or exported."""
+    """A PID controller with a given first step. Diffrax would check a given first step by a host callback, and programs
+    with callbacks can be neither cached nor exported."""
 
     first: Scalar | None = None
 
     def init(self, terms, t0, t1, y0, dt0, args, func, error_order):
-        """The first step's end, and the controller's state."""
+        """Return the first step's end, and the controller's state."""
         return super().init(terms, t0, t1, y0, self.first, args, func, error_order)
 
 
 def first_step(arc: Arc, rtol: float) -> Scalar:
-    """A step (p t) that does not jump over a small hop: half the way back to the ground; a certain hop at once."""
+    """Return a first step (p t) that does not jump over a small hop.
+
+    It is half the way back to the ground, or slightly more than the whole way for a certain hop.
+    """
     x, v, acceleration = arc.opening, arc.velocity, arc.start_acceleration
     tiny = jnp.finfo(x.dtype).tiny
     back = jnp.maximum(-acceleration, tiny)
     root = jnp.sqrt(v * v + 2 * back * x)
     to_ground = jnp.where(v > 0, (v + root) / back, 2 * x / jnp.maximum(root - v, tiny))
-    # Where the deceleration is only just beginning, it is its growth that turns the block back.
+    # Where the deceleration only begins to grow, its growth turns the block back.
     to_turn = jnp.sqrt(2 * jnp.maximum(v, 0.0) / jnp.maximum(-arc.start_jerk, tiny))
     usual = jnp.minimum(usual_step(rtol), jnp.where(to_turn > 0, 4 * to_turn, jnp.inf))
     return jnp.where(to_ground > 0, jnp.minimum(jnp.where(arc.hop, 1.1, 0.5) * to_ground, usual), usual)
@@ -284,27 +290,30 @@ class _Bracket(eqx.Module):
 
 
 class Illinois(optx.AbstractRootFinder):
-    """Root of a function that is positive at `lower` and not at `upper`: false position with Illinois's weights,
-    and bisection whenever that has not at least quartered the bracket in three steps."""
+    """Root of a function that is positive at `lower` and not at `upper`.
+
+    False position with Illinois's weights, and bisection whenever that has not at least quartered the bracket in three
+    steps.
+    """
 
     rtol: float
     atol: float
     norm: Any = eqx.field(static=True, default=jnp.abs)
 
     def init(self, fn, y, args, options, f_struct, aux_struct, tags):
-        """The bracket of the last step."""
+        """Return the bracket: the last step of the solver."""
         lower, upper = (jnp.asarray(options[name], y.dtype) for name in ("lower", "upper"))
         return _Bracket(lower, upper, fn(lower, args)[0], fn(upper, args)[0], jnp.array(0))
 
     def step(self, fn, y, args, options, state, tags):
-        """One evaluation."""
+        """Evaluate the function once, and shrink the bracket."""
         bisect = state.count % 3 == 2
         share = state.at_lower / (state.at_lower - state.at_upper)
         share = jnp.where(bisect | ~(share > 0) | ~(share < 1), 0.5, share)
         x = state.lower + share.astype(y.dtype) * (state.upper - state.lower)
         value, aux = fn(x, args)
         above = value > 0
-        # The end that stays is weighted down, so that it moves next time.
+        # The end that stays is weighted down, so that it moves in the next step.
         state = _Bracket(
             lower=jnp.where(above, x, state.lower),
             upper=jnp.where(above, state.upper, x),
@@ -315,11 +324,11 @@ class Illinois(optx.AbstractRootFinder):
         return x, state, aux
 
     def terminate(self, fn, y, args, options, state, tags):
-        """Whether the bracket is as small as rounding allows, or the root is met."""
+        """Return whether the bracket is as small as rounding allows, or the root is met."""
         small = state.upper - state.lower <= self.atol + self.rtol * jnp.abs(state.upper)
-        # A quantity that is only noise may have no root but the start.
+        # A guard within rounding of zero may have no root but the start.
         return small | (state.at_upper == 0) | (state.at_lower <= 0) | (state.count >= 200), optx.RESULTS.successful
 
     def postprocess(self, fn, y, aux, args, options, state, tags, result):
-        """The last point."""
+        """Return the last point."""
         return y, aux, {}

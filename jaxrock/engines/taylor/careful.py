@@ -1,9 +1,10 @@
 """The series engine: Taylor steps of a rocking block from event to event, exact to rounding.
 
-A lane (one block under one motion) steps through its own time. Within a smooth piece of the motion the
-opening angle is expanded about the present state, the last coefficients give the step, and the step ends
-early at the first event: impact, turning point, saddle crossing, or a new largest velocity. A block at rest
-waits for the threshold. Under `jax.vmap` lanes advance together, each at its own time; a branch that no
+A lane (one block under one motion) steps through its own time. Within a smooth piece of the motion the opening angle is
+expanded about the present state, and the last coefficients give the step. It ends early at the first event: impact,
+turning point, saddle crossing, or a new largest velocity.
+
+A block at rest waits for the threshold. Under `jax.vmap` lanes advance together, each at its own time; a branch that no
 lane needs is not taken.
 """
 
@@ -61,12 +62,12 @@ class Series(AbstractEngine):
 
     **Arguments:**
 
-    - `order`: order of the Taylor steps, 4 to 64; None takes 9 for motions of many pieces (records), else 20 for
-      linear equations and 16 for others, and fewer where a `tolerance`, or single precision, leaves room for it.
+    - `order`: order of the Taylor steps, 4 to 64. None takes 9 for motions of many pieces (records), else 20 for linear
+      equations and 16 for others. A `tolerance`, or single precision, that leaves room for it lowers these.
     - `tolerance`: local error of a step over the slenderness alpha, in (0, 1); None takes half the rounding unit.
       Larger ones take less time where there are many scenes, and leave more of them undecided.
-    - `max_steps`: step budget; None takes 100,000 (`outcome`), or 4,096 and two per piece of the motion
-      (`simulate`, which stores every step).
+    - `max_steps`: step budget; None takes 100,000 (`outcome`), or 4,096 and two per piece of the motion (`simulate`,
+      which stores every step).
 
     **Raises:** ValueError for a value outside its range.
     """
@@ -79,7 +80,7 @@ class Series(AbstractEngine):
         check_fields(self)
 
     def stepper(self, scene: Scene, stop: Scalar | None, history: bool, taped: bool = False) -> "TaylorStepper":
-        """This engine at work on a scene; short pieces of a record need few terms."""
+        """Return the stepper of a scene; short pieces of a record need few terms."""
         if not isinstance(scene.moments, Coefficients):
             raise ValueError("Argument `engine` must be a Diffrax(...) for a model that is given as functions.")
         tolerance = self.tolerance or exact(scene.p.dtype)
@@ -94,7 +95,7 @@ class Series(AbstractEngine):
         )
 
     def budget(self, scene: Scene, history: bool) -> int:
-        """Largest number of steps."""
+        """Return the largest number of steps."""
         return self.max_steps or (POLICY.history_steps + 2 * scene.most_pieces if history else POLICY.outcome_steps)
 
     @property
@@ -102,12 +103,12 @@ class Series(AbstractEngine):
         return True
 
     def loop(self, unfinished: Callable, step: Callable, carry: PyTree, budget: int) -> PyTree:
-        """A loop that stops at the last lane."""
+        """Run a loop that stops with the last lane."""
         return jax.lax.while_loop(unfinished, step, carry)
 
 
 class TaylorStepper(AbstractStepper):
-    """One scene with the engine's settings, and how far to follow it."""
+    """One scene with the engine's settings, and the time up to which to follow it."""
 
     scene: Scene
     stop: Scalar | None  # time at which to stop [s]; None: at the end of the motion
@@ -115,45 +116,46 @@ class TaylorStepper(AbstractStepper):
     order: int = eqx.field(static=True)
     tolerance: float = eqx.field(static=True)
     history: bool = eqx.field(static=True)
-    doubt: float = eqx.field(static=True, default=8.0)  # what is estimated here is rounding
-    taped: bool = eqx.field(static=True, default=False)  # reverse mode goes through
+    doubt: float = eqx.field(static=True, default=8.0)  # the errors estimated here are rounding
+    taped: bool = eqx.field(static=True, default=False)  # reverse mode goes through the steps
 
     def shaking(self, piece: Int[Array, ""], local: Scalar) -> tuple[Shaking, Scalar]:
-        """Taylor coefficients of the ground acceleration [g] in a piece, in time/unit, and the unit [s]."""
+        """Return Taylor coefficients of the ground acceleration [g] in a piece, in time/unit, and the unit [s]."""
         shaking, unit = self.scene.shaking(piece, local, self.order)
         return shaking.each(lambda terms: [keep(u, local) for u in terms]), keep(unit, local)
 
     @property
     def rounding(self) -> float:
-        """What a step adds to the error, over the slenderness, however small its last terms are."""
+        """Return the error that a step adds, over the slenderness, however small its last terms are."""
         return min(self.tolerance, exact(self.scene.p.dtype))
 
     @property
     def longest(self) -> float:
-        """How long a step may be, in the unit of its series."""
+        """Return the longest step, in the unit of its series."""
         return min(16.0, longest(self.order, self.scene.p.dtype))
 
     def advance(self, state: State) -> State:
-        """One step of a lane."""
+        """Advance a lane by one step."""
         return self.step(state, *self.shaking(state.piece, state.local))
 
     def step(self, state: State, shaking: Shaking, unit: Scalar) -> State:
-        """One step of a lane: waiting at rest, or rocking."""
+        """Advance a lane by one step: a wait at rest, or rocking."""
         resting = state.side == 0
         waited = wait(self, state, shaking, unit, self.order, self.tolerance, when)
         rocked = self.on(state.side)._rock(state, shaking, unit, ~resting)
         return checked(self, state, jax.tree.map(lambda a, b: where(resting, a, b), waited, rocked))
 
     def on_tape(self, state: State, budget: int) -> tuple[State, State]:
-        """Follow a block so that reverse mode goes through: as `states_of`."""
+        """Follow a block so that reverse mode goes through, and return all states, as `states_of`."""
         return on_tape(self, state, budget)
 
     def end_on_tape(self, state: State) -> State:
-        """The last state alone, within the budget of an outcome."""
+        """Follow a block so that reverse mode goes through, and return the last state, within the budget of an outcome.
+        Follow a block so that reverse mode goes through, and return the last state, within the budget of an outcome."""
         return end_on_tape(self, state)
 
     def finish(self, state: State) -> State:
-        """The free stage by energy."""
+        """Solve the free stage by energy."""
         scene = self.scene.on(state.side)
         moments: Any = scene.moments  # `Coefficients`: this engine solves no others
         moving = (state.side != 0) & ~state.overturned & (state.piece >= scene.pieces)
@@ -163,7 +165,7 @@ class TaylorStepper(AbstractStepper):
         visits = (here, there) if scene.far is None else (here, there, here)
         start = visits, state.opening, state.velocity, moving, state.peak
         if self.taped:
-            # In reverse mode what is not taken (roots of zero) would spoil what is.
+            # In reverse mode the branch not taken (roots of zero) would spoil the other.
             name = "free stage, to pi/2" if scene.falls_flat else "free stage"
             stage = differentiable(
                 lambda start: free_stage(*start, falls_flat=scene.falls_flat), name=name, in_lanes=True
@@ -171,21 +173,21 @@ class TaylorStepper(AbstractStepper):
         else:
             none = FreeStage.none(state.opening)
             stage = jax.lax.cond(moving, lambda: free_stage(*start, falls_flat=scene.falls_flat), lambda: none)
-        # A loss after one more impact is a new excursion; otherwise this one may have been closer before.
+        # A loss after one more impact is a new excursion; otherwise this excursion may have been closer before.
         beyond = where(stage.impacts > 0, stage.closeness, jnp.minimum(state.closeness_beyond, stage.closeness))
         higher = surpasses(stage.peak, state.peak)
-        # The energy that is missing to the saddle, 2 (E_saddle - E), and what it may be off.
+        # The energy missing to the saddle, 2 (E_saddle - E), and its error.
         slope = -2 * moments.restoring(Angle.of(state.opening))
         off = state.spread.error_of(slope, -2 * state.velocity)
         toss_up = moving & (jnp.abs(stage.deficit) <= self.doubt * off * stage.share)
-        # One that stands still in balance, within the error of the state, has no excursion that decides.
+        # A block that stands still in balance, within the error of the state, has no decisive excursion.
         toss_up = toss_up | (
             moving & (slope**2 / 4 + state.velocity**2 <= self.doubt**2 * state.spread.variance(1.0, 1.0))
         )
         toss_up = toss_up & (state.status == Status.successful)
         flat = stage.peak_steepness <= 0
         error = where(flat, off, off * stage.peak_share / where(flat, 1.0, stage.peak_steepness))
-        # Peaks are what is missing to the saddle: small ones have lost their digits.
+        # Peaks come from the energy missing to the saddle: small peaks have lost digits.
         lost = where(moving, 4 * self.rounding * moments.saddle, 0.0)
         return replace(
             state,
@@ -203,14 +205,14 @@ class TaylorStepper(AbstractStepper):
         )
 
     def evaluate(self, node: Node, elapsed: Scalar) -> tuple[Scalar, Scalar]:
-        """Expand the series again about the node."""
+        """Evaluate the history by a new series about the node."""
         shaking, unit = self.shaking(node.piece, node.local)
         coefficients = expand(self.on(node.side).start(node, shaking, unit), self.order).opening
         opening, speed = jet(coefficients, elapsed / unit, 1)
         return opening, speed / unit
 
     def start(self, state: State | Node, shaking: Shaking, unit: Scalar) -> Start:
-        """Where a step starts, with time in `unit`."""
+        """Return the start of a step, with time in `unit`."""
         stretch = jnp.ones_like(unit) if self.scene.scales is None else keep(self.scene.p * unit, state.local)
         moments: Any = self.scene.moments
         return Start(
@@ -225,10 +227,10 @@ class TaylorStepper(AbstractStepper):
         )
 
     def _rock(self, state: State, shaking: Shaking, unit: Scalar, rocking: Flag) -> State:
-        """Rocking: a Taylor step, cut at the first event."""
-        # More room than a step can take is as good as endless, and finite.
+        """Advance by a Taylor step, cut at the first event."""
+        # A step cannot use more room than that; the bound keeps it finite.
         start, room = self.start(state, shaking, unit), jnp.minimum(self.room(state), 32 * unit) / unit
-        # Where to step to is found without derivatives; then the end moves as the flow and the event tell.
+        # The step is found without derivatives; then its end moves as the flow and the event determine.
         stepper, before, begin, reach = fixed((self, state, start, room))
         step = _Step.of(stepper, before, begin, reach, rocking)
         cut = when(step.eventful, lambda cut, *when: stepper._cut(before, step, *when), step.whole)
@@ -252,7 +254,7 @@ class TaylorStepper(AbstractStepper):
         moved = (step.length > 0) & rocking
         time = where(step.length > 0, step.length * start.stretch, jnp.inf)
         missed = step.rounded + step.missed, step.rounded + step.missed * jnp.maximum(self.order / time, 1.0)
-        # After a step of no length it is what it was, to the digit, and moves as the knots do that came together.
+        # A zero-length step keeps the velocity bitwise; its derivatives follow those of coinciding knots.
         kept = where(rocking, with_derivatives_of(state.velocity, velocity), state.velocity)
         exact = landed(self.scene, hits, opening, where(moved, velocity, kept))
         jerk = where(hits.extremum, jet(derivative(step.coefficients), length, 2)[2], jnp.inf)
@@ -277,12 +279,12 @@ class TaylorStepper(AbstractStepper):
         stepped = when(step.eventful & (hits.impact | hits.turning | hits.saddle), happen, passed)
         down = stepped.opening >= jnp.pi / 2
         overturned = state.overturned | lost | down if self.scene.falls_flat else state.overturned | lost
-        # A history goes on to the ground; for an outcome the verdict is enough.
+        # A history continues to the ground; for an outcome the verdict is enough.
         ends = overturned & down if self.history else overturned
         return replace(stepped, overturned=overturned, done=stepped.done | ends)
 
     def _cut(self, state: State, step: "_Step", needed: Flag, inside) -> "_Cut":
-        """The first event of a step."""
+        """Find the first event of a step."""
         length, saddle = inside(step.length), self.scene.moments.saddle
         scaled = [inside(c) for c in rescaled(step.coefficients, length)]
         one = jnp.ones_like(length)
@@ -301,7 +303,7 @@ class TaylorStepper(AbstractStepper):
         return _Cut(landing.x * length, opening, speed, acceleration, hits._replace(impact=hits.impact & (speed <= 0)))
 
     def _happen(self, state: State, passed: State, start: Start, step: "_Step", end, cut: "_Cut", inside) -> State:
-        """Let the event at the end of a step happen."""
+        """Apply the event at the end of a step."""
         length, opening, velocity = (inside(value) for value in end)
         shaking = start.shaking.each(lambda terms: [inside(u) for u in terms])
         ground = shaking.at(length)
@@ -316,7 +318,8 @@ class TaylorStepper(AbstractStepper):
         return impact(self, noted, hits.impact, velocity, ground, *fixed((steepest, reach)))
 
     def _matters(self, state: State, scaled) -> Flag:
-        """Whether the only turning point of this step could be a new peak, or closer to overturning than before."""
+        """Return whether the only turning point of this step could be a new peak, or closer to overturning than before.
+        Return whether the only turning point of this step could be a new peak, or closer to overturning than before."""
         always = jnp.ones_like(state.beyond)
         if self.history:
             return always
@@ -327,11 +330,11 @@ class TaylorStepper(AbstractStepper):
         top = where(fall > 0, jnp.minimum(state.opening + rise, moments.saddle), moments.saddle)
         least = (moments.restoring(Angle.of(top)) / moments.restoring_at_rest) ** 2
         inward = state.velocity < 0  # it may graze the ground
-        return inward | state.beyond | (top >= 0.999 * state.peak) | (least < state.closeness)  # also a near tie
+        return inward | state.beyond | (top >= 0.999 * state.peak) | (least < state.closeness)  # 0.999: near ties, too
 
 
 class _Cut(NamedTuple):
-    """Where a step ends, its events included; per unit of the step's time."""
+    """The end of a step after a cut at its event, in the unit of the step's time."""
 
     length: Scalar
     opening: Scalar
@@ -341,25 +344,25 @@ class _Cut(NamedTuple):
 
 
 class _Step(NamedTuple):
-    """A Taylor step as far as its series goes, and whether anything may happen within it."""
+    """A Taylor step over the whole reach of its series, with tests for events within it."""
 
     coefficients: list[Scalar]
     length: Scalar
-    full: Flag  # goes as far as there is room
+    full: Flag  # goes to the end of the room
     rounded: Scalar  # errors of its end [rad]
     missed: Scalar
-    signs: tuple[Scalar, Scalar]  # with which velocity and acceleration start
-    monotone: Flag  # the acceleration keeps its sign: one turning point at most
-    faster: Flag  # the velocity may become the largest so far within it
+    signs: tuple[Scalar, Scalar]  # initial signs of velocity and acceleration
+    monotone: Flag  # the acceleration keeps its sign: at most one turning point
+    faster: Flag  # the velocity may exceed the largest so far
     eventful: Flag
-    whole: _Cut  # its end, if nothing happens
+    whole: _Cut  # its end, if no event cuts it
 
     @classmethod
     def of(cls, stepper: TaylorStepper, state: State, start: Start, room: Scalar, rocking: Flag) -> "_Step":
-        """The step from a state on."""
+        """Compute the step from a state on."""
         scene, order = stepper.scene, stepper.order
         coefficients = unbalanced(expand(start, order).opening)
-        # Relative to the motion itself while it is small: tiny rotations keep their digits too.
+        # Relative to the motion itself while it is small: tiny rotations keep their digits, too.
         size = functools.reduce(jnp.maximum, [jnp.abs(c) for c in coefficients[: max(order // 2, 4)]])
         size = jnp.minimum(scene.alpha, size)
         length = step_length(coefficients, stepper.tolerance * size, jnp.minimum(room, stepper.longest))

@@ -1,8 +1,8 @@
-"""A Taylor step of a rocking block: the series of the opening angle, and how the step's end moves with its start.
+"""A Taylor step of a rocking block: the series of the opening angle, and the derivatives of the step's end.
 
 The end of a step is linear in small changes of its start, of the forcing and of the model. Its weights follow from the
-recurrence of the series run backwards, once for the angle and once for the velocity, whatever the number of
-parameters: derivatives cost a few products each. The end itself moves, too, where an event or a knot sets it.
+recurrence of the series run backwards, once for the angle and once for the velocity. Derivatives with respect to any
+number of parameters therefore cost a few products each. The end time moves, too, where an event or a knot sets it.
 """
 
 import functools
@@ -28,7 +28,7 @@ Flag = Bool[Array, ""]
 
 
 class Start(NamedTuple):
-    """Where a step starts. Time is in a unit of choice."""
+    """The start of a step. The unit of time is free."""
 
     moments: Coefficients
     stretch: Scalar  # p times the unit of time
@@ -41,19 +41,19 @@ class Start(NamedTuple):
 
     @property
     def angle(self) -> Angle:
-        """The opening angle with its sine and cosine."""
+        """Return the opening angle with its sine and cosine."""
         angle = Angle.of(self.opening)
         return Angle(angle.value, keep_by(angle.sine, self.one), keep_by(angle.cosine, self.one))
 
 
 class End(NamedTuple):
-    """Where a step ends, and what sets that."""
+    """The end of a step, and the conditions that set it."""
 
     length: Scalar  # time from the start
     opening: Scalar
     speed: Scalar
-    level: Scalar  # opening angle at which it ends if it `meets` it
-    room: Scalar  # time at which it ends if it is `full`
+    level: Scalar  # opening angle at which it ends where it `meets` it
+    room: Scalar  # time at which it ends where it is `full`
     meets: Flag
     turns: Flag  # ends where the velocity vanishes
     full: Flag
@@ -72,7 +72,7 @@ class Expansion(NamedTuple):
 
 
 def expand(start: Start, order: int) -> Expansion:
-    """Series of x'' = -stretch^2 [(1 + v) restoring(x) + side u arm(x)].
+    """Compute the series of x'' = -stretch^2 [(1 + v) restoring(x) + side u arm(x)].
 
     The sine and cosine of the angle follow their own recurrences (Jorba & Zou 2005).
     """
@@ -82,7 +82,7 @@ def expand(start: Start, order: int) -> Expansion:
     scale = keep_by(-(start.stretch**2), one)
     pushes = [keep_by(scale * start.side, one) * u for u in start.shaking.horizontal]
     scaled = moments.restoring_terms.each(lambda c: keep_by(scale * c, one))
-    # Under a straight line every term is a few products, of the moment and the arm together: the oldest come first.
+    # Under a straight line every term is a few products, of the moment and the arm together; the oldest come first.
     straight = start.shaking.vertical is None and len(pushes) <= 2
     now, *before = (moments.arm_terms.each(lambda c, push=push: keep_by(push * c, one)) for push in pushes)
     now, last = now.plus(scaled), None
@@ -113,24 +113,24 @@ def expand(start: Start, order: int) -> Expansion:
 
 
 class _Weights(NamedTuple):
-    """What the end of a step (its angle, or its velocity) gains per change of what it depends on."""
+    """Derivatives of the end of a step (its angle, or its velocity) with respect to its inputs."""
 
     start: Start  # the weights in place of the values; zero for side and uplifting
 
     def times(self, change: Start) -> Any:
-        """The change of the end."""
+        """Return the change of the end."""
         pairs = zip(jax.tree.leaves(self.start), jax.tree.leaves(change, is_leaf=is_zero), strict=True)
         return _summed((weight, moved) for weight, moved in pairs if not is_zero(moved))
 
 
 def _summed(pairs: Iterable[tuple[Scalar, Scalar]]) -> Any:
-    """The sum of the products of pairs."""
+    """Return the sum of the products of pairs."""
     factors = list(zip(*pairs))
     return sum_of_products(*factors) if factors else 0.0
 
 
 def _weighed(terms: list | None, vertical: list[Scalar] | None, order: int, like: Scalar) -> list | None:
-    """A series times 1 + v, where the model has it."""
+    """Return a series times 1 + v, where the model has that series."""
     if vertical is None or terms is None or len(terms) < order - 1:
         return terms
     return [terms[k] + keep(product_term(vertical, terms, k), like) for k in range(order - 1)]
@@ -144,7 +144,7 @@ class _Sources(NamedTuple):
 
     @classmethod
     def of(cls, start: Start, series: Expansion, order: int, like: Scalar) -> "_Sources":
-        """From the series of a step."""
+        """Compute them from the series of a step."""
         horizontal, vertical = start.shaking
         arm = start.moments.arm_terms
         needed = arm.line is not None, arm.trigonometric, arm.trigonometric
@@ -160,7 +160,7 @@ class _Sources(NamedTuple):
         return cls(Basis(*weighed), Basis(horizontal, *pushed))
 
     def pulls(self, start: Start, order: int) -> list[Scalar]:
-        """Coefficients of how fast the moment grows with the angle."""
+        """Return the Taylor coefficients of the derivative of the moment with respect to the angle."""
         moments, side = start.moments, start.side
         is_line = not moments.trigonometric and moments.arm_terms.line is None
         constant_pull = is_line and start.shaking.vertical is None
@@ -175,11 +175,11 @@ class _Sources(NamedTuple):
 
 
 def _weights(order: int, start: Start, length: Scalar) -> tuple[_Weights, _Weights]:
-    """Weights of the angle and of the velocity at the end.
+    """Return the weights of the angle and of the velocity at the end.
 
-    A change c of the coefficients obeys c_{k+2} = scale/((k + 1)(k + 2)) [sum_j pull_j c_{k-j} + source_k], linear
-    with the coefficients `pull` of the derivative of the moment. Backwards: `of_term[m]` is what the end gains from
-    a change of coefficient m, `of_source[k]` from one of source k.
+    A change c of the coefficients obeys c_{k+2} = scale/((k + 1)(k + 2)) [sum_j pull_j c_{k-j} + source_k]. `pull`
+    holds the coefficients of the derivative of the moment. Run backwards: `of_term[m]` is the derivative of the end by
+    coefficient m, `of_source[k]` by source k.
     """
     side, stretch = start.side, start.stretch
     series = expand(start, order)
@@ -208,7 +208,7 @@ def _weights(order: int, start: Start, length: Scalar) -> tuple[_Weights, _Weigh
             return total if sign is None else sign * total
 
         def of_shaking(length_of_series, factors):
-            """What the end gains per change of coefficient j of the ground's acceleration."""
+            """Return the derivatives of the end by the coefficients of the ground acceleration."""
             pairs = ([(of_source[k], factors[k - j]) for k in range(j, order - 1)] for j in range(length_of_series))
             sums = [_summed((w, f) for w, f in each if f is not None) for each in pairs]
             return [jnp.broadcast_to(x, length.shape).astype(length.dtype) for x in sums]
@@ -230,9 +230,9 @@ def _weights(order: int, start: Start, length: Scalar) -> tuple[_Weights, _Weigh
 
 
 def arrive(order: int, start: Start, end: End) -> tuple[Scalar, Scalar, Scalar]:
-    """Length, opening angle and speed of a step's end, as they are given; their derivatives follow the flow.
+    """Return the length, opening angle and speed of a step's end, as given; their derivatives follow the flow.
 
-    Only these derive from `start`, and from `end.level` and `end.room`: the values in `end` need no derivatives.
+    Derivatives come only from `start`, and from `end.level` and `end.room`: the other values in `end` need none.
     """
     return given(_arriving, (end.length, end.opening, end.speed), (start, end), order)
 
@@ -244,7 +244,7 @@ def _arriving(order: int, values: tuple, by: tuple[Start, End], changes: tuple) 
     law = start.moments.acceleration(Angle.of(opening), speed, start.side * push, weight)
     acceleration = start.stretch**2 * law
     d_level, d_room = (0.0 if is_zero(d) else d for d in (d_end.level, d_end.room))
-    # An end that is grazed has no derivative: infinite, for the status to tell.
+    # An end that is grazed has no derivative: infinity, which the status reports.
     d_length = where(end.full, d_room, 0.0)
     d_length = where(end.turns, -d_speed / where(end.turns, acceleration, 1.0), d_length)
     d_length = where(end.meets, (d_level - d_opening) / where(end.meets, speed, 1.0), d_length)
@@ -253,10 +253,10 @@ def _arriving(order: int, values: tuple, by: tuple[Start, End], changes: tuple) 
 
 
 def extreme_speed(start: Start, length: Scalar, opening: Scalar, speed: Scalar, jerk: Scalar) -> Scalar:
-    """|speed| at the end of a step, with derivatives up to the second of that at the extremum near it.
+    """Return |speed| at the end of a step, with derivatives up to the second of the speed at the extremum near it.
 
-    The end stays where it was found, and that costs no first derivative: there the speed is as large nearby. But the
-    extremum moves, by -acceleration/jerk. `jerk`: there; infinite where the end is no extremum.
+    The end stays where it was found, at no cost to the first derivative: the speed is stationary there. But the
+    extremum moves, by -acceleration/jerk. `jerk`: the jerk there; infinite where the end is no extremum.
     """
     push, weight = start.shaking.at(length)
     law = start.moments.acceleration(Angle.of(opening), speed / start.stretch, start.side * push, weight)
@@ -264,7 +264,7 @@ def extreme_speed(start: Start, length: Scalar, opening: Scalar, speed: Scalar, 
 
 
 def _extreme(_, by: tuple, changes: tuple) -> Scalar:
-    """Of |v - a^2/(2 j)|, in which a is nothing, but not its derivatives."""
+    """Differentiate |v - a^2/(2 j)|, in which a is zero, but not its derivatives."""
     (speed, acceleration, jerk), (change, steeper, _) = by, changes
     change, steeper = (jnp.zeros_like(speed) if is_zero(d) else d for d in (change, steeper))
     return jnp.sign(speed) * (change - acceleration / jerk * steeper)

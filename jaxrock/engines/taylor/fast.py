@@ -1,8 +1,8 @@
-"""The fast pass: Taylor steps for the many scenes that need no care.
+"""The fast pass: Taylor steps for the many scenes that meet no near tie.
 
-A step is a series, a certificate of its shape, the turning point within it if there is one, and the first level that
-it meets (ground or saddle), where it is cut. What has no certificate is postponed: the series engine, which takes every
-care, does it afterwards.
+A step is a series, with a certificate of its shape and the turning point within it, if any. It is cut at the first
+level that it meets (ground or saddle). A lane without a certificate is postponed: the careful pass of the series engine
+reruns it afterwards.
 """
 
 import functools
@@ -32,18 +32,18 @@ from jaxrock.status import Status
 Scalar = Inexact[Array, ""]
 Flag = Bool[Array, ""]
 
-# Degrees of the polynomials whose roots Newton's first iterations take, if the whole is of degree 16 or less (else in
-# proportion): for a value that is stationary there, for the time of a turning point, and for what meets a level.
+# Degrees of the polynomials for Newton's first iterations, where the series has degree 16 or less (else in proportion).
+# They serve a value that is stationary at the root, the time of a turning point, and the meeting of a level.
 _FLAT, _TURN, _MEET = (6, 10), (5, 10), (5, 9)
 
 
 def _if(needed: Flag, function: Callable, otherwise):
-    """`function()` where needed: skipped if no lane of a vector needs it."""
+    """Call `function()` where needed: skipped if no lane of a vector needs it."""
     return jax.lax.cond(needed, function, lambda: otherwise)
 
 
 def _certified(terms: list[Scalar], length: Scalar, rises: Scalar) -> Scalar:
-    """How much of a step is certain to turn once at most, as a share of it; zero if nothing is.
+    """Return the share of a step that certainly contains at most one turn; zero if no part is certain.
 
     The acceleration keeps its sign there, or its derivative does.
     """
@@ -65,21 +65,22 @@ def _certified(terms: list[Scalar], length: Scalar, rises: Scalar) -> Scalar:
 
 
 class _Part(NamedTuple):
-    """The part of a step on which the velocity changes sign once at most; time is in the unit of the series."""
+    """The part of a step on which the velocity changes sign at most once; time is in the unit of the series."""
 
     length: Scalar
     opening: Scalar  # at its end, with its derivatives
     speed: Scalar
     acceleration: Scalar
-    full: Flag  # goes as far as there is room
+    full: Flag  # goes to the end of the room
     outward: Scalar  # sign of the velocity at its start
     has_extremum: Flag  # the velocity has an extremum
-    bound: Scalar  # of that
+    bound: Scalar  # of the velocity at that extremum
     certain: Flag
 
 
 def _part(start: Start, terms: list[Scalar], room: Scalar, least: Scalar, most: float) -> _Part:
-    """As much of a step as is certain, `most` at most; `least`: what the last coefficients may contribute."""
+    """Return the certain part of a step, `most` long at most; `least`: bound of what the last coefficients contribute.
+    Return the certain part of a step, `most` long at most; `least`: bound of what the last coefficients contribute."""
     one, before, first = start.one, terms[1], 2 * terms[2]
     cap = jnp.minimum(room, most)
     # Under records nearly all steps go as far as there is room: no root is taken for them.
@@ -123,8 +124,11 @@ def _part(start: Start, terms: list[Scalar], room: Scalar, least: Scalar, most: 
 
 
 def _leaving(start: Start, terms: list[Scalar], part: _Part) -> tuple:
-    """The velocity over a part, as `root_between` takes it, without the zero at its start: divided by the time where
-    the block stands still there, and by its square where it leaves rest with no acceleration, either."""
+    """Return the velocity over a part, as `root_between` takes it, without the zero at its start.
+
+    It is divided by the time where the block stands still at the start, and by the square of the time where it leaves
+    rest with zero acceleration.
+    """
     velocity, length = derivative(terms), part.length
     still = velocity[0] == 0
     later = [where(start.uplifting, b, a) for a, b in zip(velocity[1:], [*velocity[2:], jnp.zeros_like(length)])]
@@ -137,22 +141,22 @@ def _leaving(start: Start, terms: list[Scalar], part: _Part) -> tuple:
 
 
 class _Meeting(NamedTuple):
-    """Where a part of a step ends, and what happens until then."""
+    """The end of a part of a step, and the turning point before it."""
 
     at: Scalar
-    opening: Scalar  # there, with its derivatives
+    opening: Scalar  # at the end, with its derivatives
     speed: Scalar
     acceleration: Scalar
     certain: Flag
-    turned: Flag  # turned back before
+    turned: Flag  # turned back before the end
     turn_at: Scalar
-    top: Scalar  # opening angle there
+    top: Scalar  # opening angle at the turning point
     top_acceleration: Scalar
-    hits: Events  # what ends it there
+    hits: Events  # the events that end it
 
 
 def _meeting(start: Start, terms: list[Scalar], part: _Part, state: State) -> _Meeting:
-    """The turning point within a part, and the first level that it meets, before it turns or after."""
+    """Find the turning point within a part, and the first level that it meets, before or after it turns."""
     one, saddle, zero = start.one, start.moments.saddle, jnp.zeros_like(part.length)
     turns = keep_flag(part.outward * part.speed < 0, state.local)
 
@@ -197,7 +201,8 @@ def _meeting(start: Start, terms: list[Scalar], part: _Part, state: State) -> _M
 
 
 def _fastest(start: Start, terms: list[Scalar], part: _Part, at: Scalar, known: Scalar) -> tuple[Scalar, Flag]:
-    """The largest speed between the ends of a step where it exceeds what is known, and whether that is certain."""
+    """Return the largest speed between the ends of a step where it exceeds the known one, and whether that is certain.
+    Return the largest speed between the ends of a step where it exceeds the known one, and whether that is certain."""
     velocity, zero = derivative(terms), jnp.zeros_like(at)
 
     def extremum():
@@ -210,7 +215,8 @@ def _fastest(start: Start, terms: list[Scalar], part: _Part, at: Scalar, known: 
 
 
 def _missed(stepper: TaylorStepper, terms: list[Scalar], at: Scalar, least: Scalar) -> Scalar:
-    """What the last terms contribute to a step; `least`: what they may. A step that ends early misses less."""
+    """Return the truncation error of a step from its last terms; `least`: their bound. A step that ends early has less.
+    Return the truncation error of a step from its last terms; `least`: their bound. A step that ends early has less."""
     if stepper.rounding == stepper.tolerance:
         return least
     contributed = last_size(terms) * at**stepper.order
@@ -218,18 +224,18 @@ def _missed(stepper: TaylorStepper, terms: list[Scalar], at: Scalar, least: Scal
 
 
 def _stands(stepper: TaylorStepper, meeting: _Meeting) -> Flag | bool:
-    """Whether the block has not come to lie flat on the way."""
+    """Return whether the block stays above flat on the ground within the step."""
     return not stepper.scene.falls_flat or jnp.maximum(meeting.opening, meeting.top) < jnp.pi / 2
 
 
 def _lost(stepper: TaylorStepper, state: State, start: Start) -> Flag:
-    """As `escaped`, which is asked only of blocks on their way out."""
+    """Call `escaped` only for blocks that move outward past their saddle."""
     away = state.beyond & (state.velocity >= 0)
     return _if(away, lambda: escaped(stepper, state, start.angle), jnp.zeros_like(away))
 
 
 def advance(stepper: TaylorStepper, state: State) -> State:
-    """One step of a lane that rocks."""
+    """Advance a lane that rocks by one step."""
     stepper = stepper.on(state.side)
     scene, order = stepper.scene, stepper.order
     shaking, unit = stepper.shaking(state.piece, state.local)
@@ -249,14 +255,14 @@ def advance(stepper: TaylorStepper, state: State) -> State:
     elapsed = keep_by(at * unit, one)
     full = part.full & ~(hits.saddle | hits.impact | hits.turning)
     piece, local, over = stepper.move_on(state, elapsed, full)
-    time = where(at > 0, at * stretch, jnp.inf)  # there are pieces of no length
+    time = where(at > 0, at * stretch, jnp.inf)  # some pieces have zero length
     missed = _missed(stepper, terms, at, least)
     errors = 2 * missed, 2 * missed * jnp.maximum(order / time, 1.0)
     spread = errors_after(stepper, state, start.angle, shaking.now, elapsed, errors)
     passed = replace(
         state,
         spread=jax.tree.map(lambda x: keep_by(x, one), spread),
-        local=state.local + meeting.turn_at * unit,  # until the turning point is noted
+        local=state.local + meeting.turn_at * unit,  # at the turning point, for `note`
         opening=opening,
         velocity=velocity,
         beyond=state.beyond ^ hits.saddle,
@@ -296,7 +302,7 @@ def advance(stepper: TaylorStepper, state: State) -> State:
 
 
 def wait(stepper: TaylorStepper, state: State) -> State:
-    """At rest: go on to where the acceleration exceeds the threshold, or as far as that is certain not to happen."""
+    """Advance a lane at rest to where the drive exceeds the threshold, or as far as it certainly does not."""
     scene, order = stepper.scene, stepper.order
     shaking, unit = stepper.shaking(state.piece, state.local)
     room = jnp.minimum(stepper.room(state), 32 * unit) / unit
@@ -307,10 +313,11 @@ def wait(stepper: TaylorStepper, state: State) -> State:
         share = jnp.minimum(share, _monotone(drive, length))
     full = (length >= room * (1 - 1e-9)) & (share == 1)
     length = keep(share * length, state.local)
-    lasting = room > 0  # in a piece without a length nothing happens
+    lasting = room > 0  # in a zero-length piece nothing happens
 
     def of(drive, level):
-        """Whether this drive lifts the block at once, touches the threshold, or passes it in the step."""
+        """Return whether this drive lifts the block at once, touches the threshold, or passes it in the step; and its
+        end."""
         end, slack = horner(drive, length), 8 * jnp.finfo(length.dtype).eps * level
         lifts = lasting & (drive[0] > level + slack)
         touching = lasting & ~lifts & (drive[0] >= level - slack)
@@ -345,11 +352,11 @@ def wait(stepper: TaylorStepper, state: State) -> State:
 
 
 def _monotone(terms: list[Scalar], length: Scalar) -> Scalar:
-    """The share of a step within which a series is certain to keep growing or falling."""
+    """Return the share of a step within which a series is certainly monotone."""
     slope = derivative(terms) or [jnp.zeros_like(length)]
     rises = first_sign(slope[0], slope[1] if len(slope) > 1 else jnp.ones_like(length))
     share = jnp.zeros_like(length)
     for part in (*reversed(POLICY.shorter), 1.0):
         share = where(keeps_sign(slope, rises, part * length) > 0, part, share)
-    steady = horner([jnp.abs(c) for c in slope], length) * length == 0  # or a piece of no length
+    steady = horner([jnp.abs(c) for c in slope], length) * length == 0  # or zero length
     return where(steady, 1.0, share)

@@ -1,4 +1,4 @@
-"""The loop of the fast pass: a lane glides, steps or waits, until its motion is over or a step is not certain."""
+"""The loop of the fast pass: a lane glides, steps or waits, until its motion ends or a step is not certain."""
 
 import jax
 import jax.numpy as jnp
@@ -13,19 +13,19 @@ from jaxrock.numerics.apart import apart, lanes_part
 
 
 def most_steps(pieces: int) -> int:
-    """After how many steps a scene is left to the careful engine."""
+    """Return the number of steps after which a scene is left to the careful engine."""
     return POLICY.fast_steps + 3 * pieces
 
 
 def follow(stepper: TaylorStepper, state: State, limit: Int[Array, ""] | int) -> State:
-    """Follow a block to the end of the motion, to where it is postponed, or until it has taken `limit` steps in all."""
+    """Follow a block to the end of the motion, until it is postponed, or until it has taken `limit` steps in all."""
     limit = jnp.minimum(limit, most_steps(stepper.scene.most_pieces))
     is_record = POLICY.is_record(stepper.scene.most_pieces)
     return (_under_record if is_record else _under_pulse)(stepper, state, limit)
 
 
 def _under_pulse(stepper: TaylorStepper, state: State, limit: Int[Array, ""]) -> State:
-    """Lanes rest, and rock, together."""
+    """Advance lanes that rest, and lanes that rock, in two inner loops."""
 
     def until(condition, step):
         return lambda s: jax.lax.while_loop(lambda s: condition(s) & ~s.done & (s.steps < limit), step, s)
@@ -39,8 +39,7 @@ def _under_pulse(stepper: TaylorStepper, state: State, limit: Int[Array, ""]) ->
 
 
 def _under_record(stepper: TaylorStepper, state: State, limit: Int[Array, ""]) -> State:
-    """Lanes glide as long as nothing happens, and part with the others where something may, which takes many times as
-    long."""
+    """Glide while no event can happen; where one may, lanes diverge, because that step takes many times as long."""
     strongest = stepper.scene.outlook.strongest_drive
 
     def turn(carry):

@@ -1,8 +1,12 @@
-"""Gliding: pieces of a record into which no event can fall, in a small part of what a step takes.
+"""Event-free steps: pieces of a record into which no event can fall, at a small part of the cost of a step.
 
-Between two samples the opening angle is nearly a parabola. Where what is beyond that is too small to turn the block
-back, or it turns where nothing is to be noted (below a peak that was higher, above a height that was lower), a piece is
-its series, and nothing else: no root, no certificate. What errors grow to is told for all pieces of a glide together.
+Between two samples the opening angle is nearly a parabola. A piece is evaluated by its series alone, without roots or
+certificates, in two cases:
+
+- The terms beyond the parabola are too small to turn the block back.
+- The block turns where nothing is recorded: below an earlier peak, or above an earlier clearance.
+
+Error growth is accumulated, and applied when the glide ends.
 """
 
 from dataclasses import replace
@@ -22,28 +26,28 @@ from jaxrock.numerics.choice import where
 Scalar = Inexact[Array, ""]
 Flag = Bool[Array, ""]
 
-_ESCAPES = 16  # pieces after which a block beyond its saddle is asked whether it is lost
+_ESCAPES = 16  # pieces between tests whether a block beyond its saddle is lost
 
 
 class Glide(NamedTuple):
-    """Pieces that a block has gone through since its errors were last told."""
+    """Sums over the pieces of a glide, from its start or since the errors were last applied."""
 
-    goes: Flag  # it is not known yet that the next piece needs care
+    goes: Flag  # the next piece may still be free of events
     time: Scalar  # p t
     repulsion: Scalar  # integral over that time
-    missed: Scalar  # sum of the squares of what the series left out [rad^2]
-    opening: Scalar  # the largest between pieces
-    speed: Scalar
-    steps: Int[Array, ""]  # taken before it began
-    low: Scalar  # a block that turns back below here is as far from balance as ever, and its peak no news
-    high: Scalar  # nor is it news, or a graze, that a block turns outward above here
+    missed: Scalar  # sum of the squares of truncation errors [rad^2]
+    opening: Scalar  # largest at ends of pieces
+    speed: Scalar  # largest at ends of pieces
+    steps: Int[Array, ""]  # taken before the glide
+    low: Scalar  # a turn inward below this angle changes neither closeness nor peaks
+    high: Scalar  # a turn outward above this angle changes no clearance, and is no graze
 
     @classmethod
     def of(cls, stepper: TaylorStepper, state: State) -> "Glide":
-        """One that begins."""
+        """Begin a glide."""
         zero = jnp.zeros_like(state.opening)
         moments: Any = stepper.on(state.side).scene.moments  # `Coefficients`: this engine solves no others
-        # Not so near to balance that it could matter how far off the state is (see `note`).
+        # So far from balance that the error of the state cannot matter (see `note`).
         doubt = 1.5 * stepper.doubt * MOST_OFF * moments.saddle
         pull = jnp.maximum(jnp.sqrt(state.closeness) * moments.restoring_at_rest, doubt)
         low = jnp.minimum(state.second, (moments.restoring_at_rest - pull) / moments.steepest)
@@ -53,10 +57,11 @@ class Glide(NamedTuple):
 
 
 def settled(stepper: TaylorStepper, state: State, glide: Glide, strongest: Scalar) -> State:
-    """The state with what errors have grown to in a glide; `strongest`: acceleration of the ground [g]."""
+    """Return the state with the errors that have grown in a glide; `strongest`: bound of the ground acceleration [g].
+    Return the state with the errors that have grown in a glide; `strongest`: bound of the ground acceleration [g]."""
     time = glide.time
     count = (state.steps - glide.steps).astype(time.dtype)
-    per_time = 1 / where(time > 0, time, 1.0)  # there are pieces without a length
+    per_time = 1 / where(time > 0, time, 1.0)  # some pieces have zero length
     largest = replace(state, opening=glide.opening, velocity=glide.speed)
     angle, velocity = rounded(stepper, largest, strongest, time / jnp.maximum(count, 1.0))
     least = 2 * stepper.rounding * stepper.scene.alpha
@@ -65,20 +70,20 @@ def settled(stepper: TaylorStepper, state: State, glide: Glide, strongest: Scala
         missed + count * (angle + least) ** 2, missed * faster**2 + count * (velocity + least) ** 2
     )
     spread = spread.after_flow(glide.repulsion * per_time, time)
-    return replace(state, spread=Spread.where(lanes_part(), spread, state.spread))  # else there are no glides
+    return replace(state, spread=Spread.where(lanes_part(), spread, state.spread))  # else no glides
 
 
 def onward(stepper: TaylorStepper, state: State, glide: Glide) -> tuple[State, Glide]:
-    """Go to the end of a piece, or part of the way, if it is certain that nothing is to be noted; else nowhere."""
+    """Advance to the end of a piece, or part of the way, if certainly nothing is to be recorded; else not at all."""
     stepper = stepper.on(state.side)
     scene, moments = stepper.scene, stepper.scene.moments
     reach = Reach.of(stepper, state)
     start, opening = reach.start, reach.opening
-    swing = reach.room * jnp.abs(start.speed)  # no turning point is further off
+    swing = reach.room * jnp.abs(start.speed)  # no turning point is farther away
     quiet = where(reach.slows, start.opening + swing <= glide.low, start.opening - swing >= glide.high)
     unnoted = reach.one_way | (reach.steady & quiet & ~state.beyond)
-    asked = state.piece % _ESCAPES < (1 if scene.following is None else 2)  # of two pieces one may be passed over
-    escapes = state.beyond & (start.speed > 0) & asked  # perhaps: now and then
+    asked = state.piece % _ESCAPES < (1 if scene.following is None else 2)  # two: `following` may skip a piece
+    escapes = state.beyond & (start.speed > 0) & asked  # possibly; tested at intervals
     stays = (opening > 0) & ((opening >= moments.saddle) == state.beyond) & ~escapes
     rocks = (state.side != 0) & ~state.uplifting
     sure = rocks & reach.holds & reach.no_faster(state.fastest) & unnoted & stays

@@ -1,4 +1,4 @@
-"""What is policy in the series engine, not mathematics: numbers that change times, but no result beyond its error."""
+"""Policy of the series engine, not mathematics: numbers that change times, but no result beyond its error."""
 
 import math
 from typing import NamedTuple
@@ -7,15 +7,16 @@ import jax.numpy as jnp
 
 
 class Policy(NamedTuple):
-    """How the series engine goes about it.
+    """Settings of the series engine.
 
-    - `pulse_order`, `linear_order`, `record_order`: of Taylor steps under motions of few pieces, the same where the
-      equation is linear, whose terms cost little, and under many pieces; short ones need few terms.
-    - `many_pieces`: from which number of pieces on a motion counts as a record.
+    - `pulse_order`: order of Taylor steps under motions of few pieces.
+    - `linear_order`: the same for linear equations, whose terms cost little.
+    - `record_order`: order under many pieces; short pieces need few terms.
+    - `many_pieces`: number of pieces above which a motion counts as a record.
     - `outcome_steps`: step budget of an outcome; `history_steps`: of a history, besides two for each piece.
-    - `fast_steps`: after which a scene is left to the careful pass, besides three for each piece.
+    - `fast_steps`: steps after which a scene is left to the careful pass, besides three for each piece.
     - `shorter`: shares of a step that are tried for a certificate, after the whole.
-    - `round`: steps after which scenes under a record make up new chunks where XLA follows them.
+    - `round`: steps after which scenes under a record form new chunks where XLA follows them.
     """
 
     pulse_order: int = 16
@@ -29,13 +30,13 @@ class Policy(NamedTuple):
     round: int = 256
 
     def is_record(self, pieces: int) -> bool:
-        """Whether a motion of so many pieces counts as a record."""
+        """Return whether a motion of so many pieces counts as a record."""
         return pieces > self.many_pieces
 
     def order(self, pieces: int, tolerance: float, linear: bool) -> int:
-        """Order of the steps where nobody has set it."""
+        """Return the default order of the steps."""
         digits = -math.log10(tolerance)
-        if self.is_record(pieces):  # whose steps are as long as their pieces, whatever the tolerance
+        if self.is_record(pieces):  # its steps are as long as its pieces, whatever the tolerance
             return int(min(self.record_order, max(6, digits / 2 + 3)))
         if linear:
             return int(min(self.linear_order, max(10, digits + 5)))
@@ -46,5 +47,5 @@ POLICY = Policy()
 
 
 def exact(dtype) -> float:
-    """The tolerance with which rounding is all that is left."""
+    """Return the tolerance at which only rounding errors remain."""
     return float(jnp.finfo(dtype).eps) / 2

@@ -1,7 +1,7 @@
-"""How far a block goes within a piece of a record, and whether anything may happen on the way.
+"""A trial step within a piece of a record: its end, and whether an event may fall into it.
 
-By its series, or, where the equation is linear, exactly: about the balance that moves with the ground the opening angle
-is a hyperbolic sine and cosine, whose acceleration changes its sign once at most.
+The end follows from the series, or, where the equation is linear, exactly. About the balance that moves with the ground
+the opening angle is a hyperbolic sine and cosine, whose acceleration changes its sign at most once.
 """
 
 import math
@@ -20,42 +20,44 @@ from jaxrock.numerics.xla_cpu import keep_by
 Scalar = Inexact[Array, ""]
 Flag = Bool[Array, ""]
 
-# Of (cosh(x) - 1)/x^2 and (sinh(x) - x)/x^3 in x^2, to rounding up to here.
+# Series of (cosh(x) - 1)/x^2 and (sinh(x) - x)/x^3 in x^2, accurate to rounding up to here.
 _EXACT = 0.04
 _EVEN, _ODD = (tuple(1 / math.factorial(2 * k + first) for k in range(5)) for first in (2, 3))
 
 
 class Reach(NamedTuple):
-    """From a state to the end of a piece, or a half or a quarter of the way. Time is in the unit of `start`, but for
-    `unit`."""
+    """A trial step from a state to the end of a piece, or a half or a quarter of the way.
+
+    Time is in the unit of `start`, but for `unit`.
+    """
 
     start: Start
     unit: Scalar  # [s]
-    room: Scalar  # how far it goes
-    full: Flag  # to the end
-    holds: Flag  # as exactly as it has to
-    missed: Scalar  # what is left out at its end [rad]
-    opening: Scalar  # there
+    room: Scalar  # length
+    full: Flag  # ends with the piece
+    holds: Flag  # accurate to the tolerance
+    missed: Scalar  # truncation error at its end [rad]
+    opening: Scalar  # at its end
     speed: Scalar
     slows: Flag  # the acceleration is negative at its start
-    steady: Flag  # the velocity grows, or falls, all the way
+    steady: Flag  # the velocity is monotone
     one_way: Flag  # the block does not turn
-    largest: Scalar  # bound of how fast it is on the way
+    largest: Scalar  # bound of the speed within it
 
     @classmethod
     def of(cls, stepper: TaylorStepper, state: State) -> "Reach":
-        """From a state on, of which `stepper` is on the side."""
+        """Compute the trial step from a state; `stepper` is that of its side."""
         shaking, unit = stepper.shaking(state.piece, state.local)
         start, whole = stepper.start(state, shaking, unit), stepper.room(state) * (1 / unit)
         return (_exactly if _is_linear(start) else _by_series)(stepper, start, unit, whole)
 
     @property
     def time(self) -> Scalar:
-        """p t of how far it goes."""
+        """Return its length in p t."""
         return self.room * self.start.stretch
 
     def no_faster(self, fastest: Scalar) -> Flag:
-        """Whether it is nowhere on the way faster than at an end or (per p t) than this."""
+        """Return whether the speed exceeds neither that at the ends nor `fastest` (per p t)."""
         return (self.largest <= fastest * self.start.stretch) | self.steady
 
 
@@ -69,7 +71,7 @@ def _by_series(stepper: TaylorStepper, start: Start, unit: Scalar, whole: Scalar
     room = keep_by(where(full, whole, where(half, 0.5, 0.25) * whole), start.one)
     missed = missed * where(full, 1.0, where(half, 0.5**order, 0.25**order))
 
-    # How far the acceleration is off its first value on the way, and the velocity off a straight line.
+    # Bounds of how far the acceleration departs from its first value, and the velocity from a straight line.
     change = room * horner([k * jnp.abs(c) for k, c in enumerate(speeds)][2:], room)
     bend = 0.5 * room * change
     first, then = jnp.abs(speeds[0]), where(speeds[0] < 0, -1.0, 1.0) * (speeds[0] + room * speeds[1])
@@ -90,7 +92,7 @@ def _by_series(stepper: TaylorStepper, start: Start, unit: Scalar, whole: Scalar
 
 
 def _is_linear(start: Start) -> bool:
-    """Whether x'' = rate (x - saddle) + a straight line."""
+    """Return whether x'' = rate (x - saddle) + a straight line."""
     moments, (horizontal, vertical) = start.moments, start.shaking
     is_line = not moments.trigonometric and moments.arm_terms.line is None
     return is_line and vertical is None and len(horizontal) <= 2
@@ -101,7 +103,7 @@ def _exactly(stepper: TaylorStepper, start: Start, unit: Scalar, whole: Scalar) 
     pull = -moments.restoring_terms.line
     rate = start.stretch**2 * pull
     # The balance moves along a straight line, about which offset'' = rate offset (D&D 2012, 3.1).
-    lever = start.side * (moments.arm_terms.constant / pull)  # the quotient stays the same
+    lever = start.side * (moments.arm_terms.constant / pull)  # a quotient that no step changes
     now, *rest = start.shaking.horizontal
     drift = lever * rest[0] if rest else jnp.zeros_like(whole)
     offset = start.opening - moments.restoring_terms.constant / pull - lever * now
@@ -117,7 +119,7 @@ def _exactly(stepper: TaylorStepper, start: Start, unit: Scalar, whole: Scalar) 
     speed = start.speed + (grown * relative + rate * (room + lag) * offset)
     end = offset + (grown * offset + (room + lag) * relative)
 
-    # What solves that equation is nowhere larger than at its ends, and has one zero at most.
+    # A solution of that equation is nowhere larger than at its ends, and has at most one zero.
     steady = offset * end > 0
     change = rate * room * jnp.maximum(jnp.abs(offset), jnp.abs(end))
     first, then = jnp.abs(start.speed), jnp.abs(speed)

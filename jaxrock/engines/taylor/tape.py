@@ -1,8 +1,8 @@
-"""A run of steps on tape: derivatives by many numbers at once, such as all samples of a record, in reverse mode.
+"""Steps on a tape: reverse-mode derivatives by many numbers at once, such as all samples of a record.
 
-A run without derivatives tells the states before all steps. Each step is then a scene of its own: where a block is
-after it, by where it was, by what the step is told of the ground, and by the numbers of the block. These slopes are
-computed for many steps at once; changes go from step to step by products with them, and such a chain transposes.
+A run without derivatives computes the states before all steps. Each step then is a function of the state before it, of
+the ground motion within it, and of the parameters of the block. The Jacobians of many steps are computed at once. Their
+products carry tangents from step to step, and such a chain transposes.
 """
 
 from dataclasses import replace
@@ -25,10 +25,10 @@ from jaxrock.transforms.scenes import AT_ONCE
 
 Scalar = Inexact[Array, ""]
 Stepper = Any  # a `TaylorStepper`, whose module imports this one
-_TOGETHER = 256  # steps whose slopes are computed at once
-_PATH = ("local", "opening", "velocity")  # what a step starts from
-# What a state has seen so far is kept by a step, or found anew from the path; but for two, which become the first of
-# these as it was.
+_TOGETHER = 256  # steps whose Jacobians are computed at once
+_PATH = ("local", "opening", "velocity")  # the state variables of a step
+# A step keeps each recorded extremum, or computes it from the path. Two of them may instead take the previous value of
+# these first ones.
 _FIRST = ("peak", "clearance")
 _LATER = ("second", "peak_clearance")
 _OTHERS = ("peak_time", "fastest", "impact_time", "impact_velocity", "closeness", "closeness_beyond")
@@ -36,7 +36,7 @@ _SEEN = (*_FIRST, *_LATER, *_OTHERS)
 
 
 class _Ground(NamedTuple):
-    """What a step is told of the motion: its series about a time `local` after the start of a piece."""
+    """The ground motion that a step sees: its series about a time `local` after the start of a piece."""
 
     shaking: Shaking
     unit: Scalar
@@ -45,13 +45,13 @@ class _Ground(NamedTuple):
 
     @classmethod
     def of(cls, stepper: Stepper, piece: Int[Array, ""], local: Scalar) -> "_Ground":
-        """At this time."""
+        """Evaluate the motion at this time."""
         shaking, unit = stepper.shaking(piece, local)
         return cls(shaking, unit, stepper.scene.start(piece), stepper.scene.length(piece))
 
 
 class _Numbers(NamedTuple):
-    """What the steps of a scene depend on, besides the motion."""
+    """The inputs of the steps of a scene, besides the motion."""
 
     moments: Any
     far: Any
@@ -63,22 +63,22 @@ class _Numbers(NamedTuple):
 
     @classmethod
     def of(cls, stepper: Stepper) -> "_Numbers":
-        """Those of a scene."""
+        """Collect the inputs of a scene."""
         scene = stepper.scene
         return cls(scene.moments, scene.far, scene.p, scene.alpha, scene.reset, scene.far_reset, stepper.stop)
 
     def put_into(self, stepper: Stepper, here: Here) -> Stepper:
-        """The stepper with these numbers, of which a motion has one piece."""
+        """Return the stepper with these inputs, and with one piece of the motion."""
         numbers = self._asdict()
         stop = numbers.pop("stop")
         return replace(stepper, scene=replace(stepper.scene, **numbers, here=here), stop=stop)
 
 
 class _Slopes(NamedTuple):
-    """Derivatives of path and what is seen after a step.
+    """Derivatives of path and recorded extrema after a step.
 
-    - `columns`: of each of these, in directions of the path and of all numbers that move: a list.
-    - `kept`: of what is seen by itself; `passed`: of the later ones by the first.
+    - `columns`: a list with the derivatives of each of these by the path and by all inputs with tangents.
+    - `kept`: the derivative of each extremum by its previous value; `passed`: of the later ones by the first ones.
     """
 
     columns: list
@@ -87,10 +87,10 @@ class _Slopes(NamedTuple):
 
 
 def end_on_tape(stepper: Stepper, state: State) -> State:
-    """Follow a block: the last state, as that of `on_tape`.
+    """Follow a block, and return the last state, as `on_tape`.
 
-    Steps of outcomes may be many more than those of histories: room for all would take most blocks ten times as long
-    as all else. They are followed as often as it takes, with room for a history at a time.
+    An outcome may take many more steps than a history: memory for all would cost most blocks ten times the time of
+    everything else. Stretches with the memory of a history are repeated until the block is done.
     """
     engine, scene = stepper.engine, stepper.scene
     most, usual = (engine.budget(scene, history) for history in (False, True))
@@ -105,8 +105,10 @@ def end_on_tape(stepper: Stepper, state: State) -> State:
 
 
 def on_tape(stepper: Stepper, state: State, room: int, limit: Int[Array, ""] | None = None) -> tuple[State, State]:
-    """Follow a block: the last state, and those before every step, as `states_of` tells them; with derivatives of which
-    reverse mode takes the product with very many numbers."""
+    """Follow a block: return the last state, and those before every step, as `states_of`.
+
+    Reverse mode differentiates them by very many numbers through products.
+    """
     still, start = fixed((replace(stepper, taped=False), state))
     stretches = -(-room // _TOGETHER)
     last, nodes = fixed(states_of(still, start, stretches * _TOGETHER, room if limit is None else limit))
@@ -122,11 +124,12 @@ def _reals(states: State) -> list:
 
 
 def _with_reals(states: State, reals: list) -> State:
-    return eqx.tree_at(_reals, states, reals)  # of many states, too, which have an axis in front
+    return eqx.tree_at(_reals, states, reals)  # the states may have an axis in front
 
 
 def _changes(values: tuple, by: tuple, changes: tuple) -> tuple[list, list]:
-    """Changes of the last state, and of those before every step: along the steps, by products with their slopes."""
+    """Return the tangents of the last state, and of those before every step: products with the Jacobians of the steps.
+    Return the tangents of the last state, and of those before every step: products with the Jacobians of the steps."""
     (_, reals), (_, told, still, nodes, steps), (first, d_told, *_) = values, by, changes
     first = jnp.stack([jnp.zeros(d.aval.shape, d.aval.dtype) if is_zero(d) else d for d in first])
     numbers, by_numbers = _parted(told[0], d_told[0], jnp.zeros(0, first.dtype))
@@ -139,7 +142,7 @@ def _changes(values: tuple, by: tuple, changes: tuple) -> tuple[list, list]:
         start, by_ground = rows
 
         def go(change):
-            # (As rows of the loop all of them would be copied first.)
+            # As `xs` of the scan all of them would be copied first.
             here = jax.tree.map(lambda x: jax.lax.dynamic_slice_in_dim(x, start, _TOGETHER), (nodes, ground))
             products = jax.vmap(lambda node, ground, by: _products(still, node, numbers, ground, by_numbers, by))
             going = start + jnp.arange(_TOGETHER) < steps
@@ -156,7 +159,7 @@ def _changes(values: tuple, by: tuple, changes: tuple) -> tuple[list, list]:
 
 
 def _parted(told: Any, changes: Any, none: Array) -> tuple[tuple, Array]:
-    """What moves of what steps are told, and the rest; and the changes of the former in a row, behind `none`."""
+    """Partition the inputs into those with tangents and the rest; flatten the tangents behind `none`."""
     moving = jax.tree.map(lambda x, d: None if is_zero(d) else x, told, changes)
     rest = jax.tree.map(lambda x, d: x if is_zero(d) else None, told, changes)
     known = [d for d in jax.tree.leaves(changes, is_leaf=is_zero) if not is_zero(d)]
@@ -164,7 +167,7 @@ def _parted(told: Any, changes: Any, none: Array) -> tuple[tuple, Array]:
 
 
 def _one(change: Array, step: tuple) -> tuple[Array, Array]:
-    """The change of a state after a step, and that before it."""
+    """Return the tangent of a state after a step, and that before it."""
     going, by_path, kept, passed, own = step
     path, seen = change[: len(_PATH)], change[len(_PATH) :]
     none = jnp.zeros_like(change)
@@ -174,8 +177,8 @@ def _one(change: Array, step: tuple) -> tuple[Array, Array]:
 
 
 def _products(still: Stepper, node: State, numbers: tuple, ground: tuple, by_numbers: Array, by_ground: Array) -> tuple:
-    """Of a step: slopes by the path, of what is seen by itself, and the change by all else that moves. `numbers`,
-    `ground`: what moves of them, and the rest."""
+    """Return, for a step, the Jacobian by the path, that of each extremum by itself and by the first ones, and the
+    tangent from all other inputs. `numbers`, `ground`: the inputs with tangents, and the rest."""
     moving, rest = zip(numbers, ground)
     leaves = [*_path_of(node), *jax.tree.leaves(moving)]
     slopes = differentiable(_slopes, name="slopes of a step", in_lanes=True, derivatives="by directions")
@@ -188,7 +191,7 @@ def _products(still: Stepper, node: State, numbers: tuple, ground: tuple, by_num
 
 
 def _slopes(given_: tuple) -> _Slopes:
-    """Derivatives of a step in directions of its path and of all that moves."""
+    """Differentiate a step in directions of its path and of all inputs with tangents."""
     stepper, rest, moving, node, directions = given_
     local = fixed(node.local)
     leaves, structure = jax.tree.flatten(moving)
@@ -198,7 +201,7 @@ def _slopes(given_: tuple) -> _Slopes:
         numbers, ground = eqx.combine(moving, rest)
         told = numbers.put_into(stepper, Here(node.piece, ground.start, ground.length))
         before = replace(node, **dict(zip(_PATH, path)), **dict(zip(_SEEN, seen)))
-        # The same numbers; but the start of the step moves with what came before.
+        # The shift is zero: its tangent moves the series with the start of the step.
         after = told.step(before, ground.shaking.shifted((before.local - local) / ground.unit), ground.unit)
         return [getattr(after, name) for name in (*_PATH, *_SEEN)]
 
@@ -215,7 +218,7 @@ def _slopes(given_: tuple) -> _Slopes:
         (_, columns), (changes, _) = jax.jvp(by_path, (seen,), (list(direction),))
         return columns, changes[len(path) :]
 
-    # Two directions tell all slopes of what is seen: the first ones with the others, and the later ones.
+    # Two directions separate all derivatives by the extrema: the first ones with the others, and the later ones.
     later = jnp.array([name in _LATER for name in _SEEN])
     both = jnp.stack([~later, later]).astype(node.local.dtype)
     columns, seen_by = jax.vmap(by_seen, out_axes=(None, 0))(*both.T)
