@@ -1,4 +1,4 @@
-"""Questions about many responses: spectra, overturning maps, critical amplitudes, sensitivities, similarity; grids.
+"""Studies of many responses: spectra, overturning maps, critical amplitudes, sensitivities, similarity; grids.
 
 Imports `responses` and `sweeps`. Start with `spectra`.
 """

@@ -1,7 +1,7 @@
-"""A rock in every vertical plane under both horizontal components of a record: the planar bound over azimuths.
+"""Planar outcomes of a rock over azimuths, under both horizontal components of a record: the planar bound.
 
-Every plane is followed by itself, with the rock's section and the record's component in it. What couples planes
-(twisting, rolling along an edge, sliding) is not modelled.
+Each vertical plane is analysed alone, with the rock's section and the record's component in that plane. Coupling
+between planes (twisting, rolling along an edge, sliding) is not modelled.
 """
 
 import warnings
@@ -30,10 +30,10 @@ from jaxrock.studies.suite_scenes import STOOD, TOPPLED, UNDECIDED, of_motion, r
 
 
 class AzimuthOutcomes(AbstractTable):
-    """What becomes of a rock in every vertical plane; a table.
+    """Outcomes of a rock in every vertical plane; a table.
 
     - `azimuth`: (azimuths,) of the planes, in the rock's axes [rad]; `scale`: (scales,) of the record.
-    - `blocks`: the rock in them, with parameters of shape (azimuths,).
+    - `blocks`: planar block of the rock in each plane, with parameters of shape (azimuths,).
     - `verdict`, `rotation`, `margin`: (azimuths, scales), as in `SuiteOutcomes`.
     """
 
@@ -52,13 +52,13 @@ class AzimuthOutcomes(AbstractTable):
 
     @property
     def toppled(self) -> Int8[np.ndarray, " scales"]:
-        """The planar bound at every scale: 1 if some plane topples, 0 if all stand, -1 if that is undecided."""
+        """Planar bound at every scale: 1 if some plane topples, 0 if all stand, -1 if that is undecided."""
         some, undecided = ((self.verdict == each).any(axis=0) for each in (TOPPLED, UNDECIDED))
         return np.where(some, TOPPLED, np.where(undecided, UNDECIDED, STOOD)).astype(np.int8)
 
     @property
     def weakest(self) -> Float[np.ndarray, " scales"]:
-        """At every scale the azimuth of the lowest margin [rad], of planes that are decided; NaN if none is."""
+        """Azimuth of the lowest margin at every scale [rad], among decided planes; NaN if no plane is decided."""
         known = np.where(np.isnan(self.margin), np.inf, self.margin)
         return np.where(np.isfinite(known).any(axis=0), self.azimuth[known.argmin(axis=0)], np.nan)
 
@@ -76,26 +76,27 @@ def azimuth_outcomes(
     engine: AbstractEngine | None = None,
     progress: bool | None = None,
 ) -> AzimuthOutcomes:
-    """What becomes of a rock whose slenderness varies with azimuth, in every vertical plane of it.
+    """Compute the outcome of a rock in every vertical plane; its slenderness may vary with azimuth.
 
     **Arguments:**
 
-    - `rock`: a `Rock`; or a function of an azimuth [rad] that gives the `Block` or `AsymmetricBlock` in its plane, side
-      1 of which is towards the azimuth.
-    - `components`: both horizontal components of a record, perhaps the vertical one.
-    - `azimuth`: (azimuths,) of planes, in the rock's axes [rad]; None: 36 from 0 to pi. Each holds both of its sides.
+    - `rock`: a `Rock`; or a function of an azimuth [rad] that returns the `Block` or `AsymmetricBlock` in its plane,
+      side 1 of which is towards the azimuth.
+    - `components`: both horizontal components of a record, optionally the vertical one.
+    - `azimuth`: (azimuths,) of planes, in the rock's axes [rad]; None: 36 from 0 to pi. Each plane covers both of its
+      sides.
     - `scale`: factors on the record, a number or a list, positive and rising.
     - `orientation`: azimuth of the record's first component in the rock's axes [rad].
-    - `vertical`: whether the vertical component shakes it, too, if there is one.
+    - `vertical`: whether the vertical component, if there is one, also shakes the rock.
     - `model`, `engine`, `progress`: as in `rocking_spectrum`.
 
-    **Returns:** an `AzimuthOutcomes`: `weakest` is the direction to which a rock is turned for the planar bound, and
-    `components.along(weakest - orientation)` the record there.
+    **Returns:** an `AzimuthOutcomes`. Its `weakest` is the azimuth that governs the planar bound, and
+    `components.along(weakest - orientation)` is the record along it.
 
-    It warns of a rock whose base is rounded in some plane.
+    It warns if the base of the rock is rounded in some plane.
 
-    **Raises:** ValueError for arguments outside their ranges, and for a function that gives no block, or blocks of two
-    kinds.
+    **Raises:** ValueError for arguments outside their ranges, and for a function that returns no block, or blocks of
+    two kinds.
     """
     if not isinstance(rock, Rock) and (not callable(rock) or isinstance(rock, type)):
         raise ValueError(f"Argument `rock` must be a Rock, or a function of an azimuth, but is {shown(rock)}.")
@@ -118,7 +119,7 @@ def azimuth_outcomes(
 
 
 def _blocks(rock: Rock | Callable, angles: np.ndarray) -> Block | AsymmetricBlock:
-    """The rock in all planes, its parameters of shape (azimuths,)."""
+    """Return the block of the rock in all planes, with parameters of shape (azimuths,)."""
     if isinstance(rock, Rock) and any(any(rock.section(float(angle)).rolls) for angle in angles):
         warnings.warn(
             "The base is rounded: the rock is taken to rock about the outermost points of the ground it stands on, as "

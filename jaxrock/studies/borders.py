@@ -1,9 +1,11 @@
-"""Exact borders of overturning maps: regions between curves on which a block just stands, islands and gaps included.
+"""Exact borders of overturning maps: curves on which a block just stands, with islands and safe gaps between them.
 
-Along every column of a map, one frequency of the pulse, all ends of the overturning intervals are found as critical
-amplitudes are. Intervals of neighbouring columns that belong together make a region. Where they do not fit, because a
-region begins, ends, forks or bends there, columns are put between, down to a ten-millionth of the width. Slow pulses
-have islands without number, ever lower: those that cannot be seen in the map are drawn as far as they were found.
+A column of a map is one frequency of the pulse. In each column the ends of all overturning intervals are found as
+critical amplitudes are. Matching intervals of neighbouring columns form a region. Columns are inserted where intervals
+do not match, because a region begins, ends, forks or bends there, down to a ten-millionth of the width.
+
+Slow pulses have unboundedly many islands at ever lower intensities. Islands too small to be seen in the map are drawn
+only as far as they were found.
 """
 
 import math
@@ -45,12 +47,12 @@ class Region(NamedTuple):
 
 
 class Borders(NamedTuple):
-    """What `overturning_borders` finds.
+    """Result of `overturning_borders`.
 
     - `regions`: a list of `Region`s.
-    - `crowded`: (n, 2) ranges of frequency ratios in which there are too many islands to be told apart, in which the
-      engine gave up (a step budget that is too small), or where points of the map say otherwise. Regions there are not
-      to be trusted.
+    - `crowded`: (n, 2) ranges of frequency ratios in which regions are not to be trusted. Islands there are too many to
+      be told apart, or the engine gave up (a step budget that is too small), or points of the map contradict the
+      intervals.
     """
 
     regions: list[Region]
@@ -66,15 +68,15 @@ class _Interval(NamedTuple):
 
 @arguments
 def overturning_borders(result: OverturningMap, *, progress: bool | None = False) -> Borders:
-    """The regions of an overturning map in which blocks overturn, between their exact borders.
+    """Find the regions of an overturning map in which blocks overturn, between their exact borders.
 
     **Arguments:**
 
-    - `result`: from `overturning_map`, without further axes; its grid only says where to look.
+    - `result`: from `overturning_map`, without further axes; its grid only tells the search where to look.
     - `progress`: whether to draw a progress bar; None: on a terminal, if it takes long.
 
-    **Returns:** `Borders`. Intervals of intensities that are much narrower than a hundredth of the range and
-    give no sign of themselves beside them may be missed; a safe gap between different numbers of impacts is not.
+    **Returns:** `Borders`. An interval of intensities may be missed if it is much narrower than a hundredth of the
+    range and leaves no trace in the margins beside it. A safe gap between different numbers of impacts is not missed.
 
     **Raises:** ValueError for a map with further axes, of one column or one row (or of several that are alike), or that
     was not computed by `overturning_map`; TypeError within `jax.jit`, `jax.vmap` or a derivative.
@@ -90,18 +92,18 @@ def overturning_borders(result: OverturningMap, *, progress: bool | None = False
             "`overturning_map`."
         )
     found = borders_within(result, None, progress)
-    assert found is not None  # of as many scenes as it takes
+    assert found is not None  # without a budget the search always finishes
     return found
 
 
 def has_two_axes(result: OverturningMap) -> bool:
-    """Whether both axes of a map have an extent: two values or more, and not the same ones."""
+    """Return whether both axes of a map have an extent: at least two different values."""
     axes = np.asarray(result.frequency_ratio), np.asarray(result.intensity)
     return all(axis.ndim == 1 and np.ptp(axis) > 0 for axis in axes)
 
 
 def borders_within(result: OverturningMap, most: int | None, progress: bool | None = False) -> Borders | None:
-    """As `overturning_borders`, of a map that is known to have two axes; None if it takes more scenes than `most`."""
+    """Find borders as `overturning_borders` does, of a map with two axes; None if it takes more scenes than `most`."""
     ratio, intensity = np.asarray(result.frequency_ratio), np.asarray(result.intensity)
     search = _Search(result.scene, float(intensity.min()), float(intensity.max()), progress, _Budget(most))
     try:
@@ -111,17 +113,17 @@ def borders_within(result: OverturningMap, most: int | None, progress: bool | No
 
 
 class _TooMany(Exception):
-    """More scenes than a search may ask."""
+    """Raised when a search needs more scenes than its budget."""
 
 
 class _Budget:
-    """How many scenes may still be asked; None: any number."""
+    """Number of scenes that a search may still compute; None: unlimited."""
 
     def __init__(self, most: int | None):
         self.left = most
 
     def take(self, count: int) -> None:
-        """Take some of them, or raise `_TooMany`."""
+        """Take `count` scenes from the budget, or raise `_TooMany`."""
         if self.left is None:
             return
         self.left -= count
@@ -146,7 +148,7 @@ def _found(search: "_Search", ratio: np.ndarray, intensity: np.ndarray, state: n
 
 
 def _contradicts(column: "list[_Interval] | None", intensity: np.ndarray, state: np.ndarray) -> bool:
-    """Whether points of a map, not too near to a border, are of another verdict than the intervals of their column."""
+    """Return whether points of a map contradict the intervals of their column, apart from points close to a border."""
     if column is None:
         return False
     lost = np.zeros(intensity.size, bool)
@@ -159,7 +161,7 @@ def _contradicts(column: "list[_Interval] | None", intensity: np.ndarray, state:
 
 
 class _Search(NamedTuple):
-    """What is asked of a column."""
+    """Search along the columns of a map, between two intensities and within a budget."""
 
     scene: tuple
     low: float
@@ -168,12 +170,12 @@ class _Search(NamedTuple):
     budget: _Budget = _Budget(None)
 
     def at(self, z: np.ndarray, ratio: np.ndarray) -> tuple:
-        """Margin, its slope and impacts at logarithms of intensities, and frequency ratios beside them."""
+        """Margin, its slope and the number of impacts at pairs of log intensity `z` and frequency ratio."""
         self.budget.take(z.size)
         return tuple(map(np.asarray, surface(_point, (z, ratio), self.scene, "borders", self.progress, outer=False)))
 
     def columns(self, ratio: np.ndarray) -> list[list[_Interval] | None]:
-        """The overturning intervals of every column; None where a point that was asked for them had no result."""
+        """Overturning intervals of every column; None for a column in which a requested point has no result."""
         steps = self.low + (self.high - self.low) * np.geomspace(1e-4, 1.0, _FIRST)
         grid = np.broadcast_to(np.log([self.low, *steps]), (ratio.size, _FIRST + 1))
         failed: set[float] = set()
@@ -209,9 +211,10 @@ class _Search(NamedTuple):
 
 
 def _cuts(ask: Callable, found: list[tuple]) -> dict[tuple, float]:
-    """Where blocks overturn after impacts below and, without a safe gap between, without any above; or conversely.
+    """Find the intensity at which an interval switches between overturning with and without impacts.
 
-    By the interval: both ends and the frequency ratio."""
+    There is no safe gap at this cut. The result is keyed by the interval: both ends and the frequency ratio.
+    """
     mixed = [row for row in found if _is_mixed(row[0], row[1])]
     if not mixed:
         return {}
@@ -229,7 +232,7 @@ def _is_mixed(lower: tuple, upper: tuple) -> bool:
 
 
 def _parts(row: tuple, cuts: dict[tuple, float]) -> list[_Interval]:
-    """The interval between two ends, in two where the one part is without impacts."""
+    """Split the interval between two ends at its cut, if overturning is free of impacts on one side of the cut only."""
     (low, first), (high, last), _ = row
     if not _is_mixed(*row[:2]):
         return [_Interval(math.exp(low), math.exp(high), first, (first, last))]
@@ -251,9 +254,10 @@ def _point(z, ratio, scene):
 
 
 def _pairs(here: list[_Interval], there: list[_Interval], strict: bool) -> list[tuple[int, int]]:
-    """Which intervals of two columns belong together: they overlap, and no other one of their kind does.
+    """Match intervals of two columns: they overlap, and neither overlaps another interval of that kind.
 
-    `strict`: only those after as many impacts; otherwise, of what is left then, also after other numbers of them.
+    `strict`: match only intervals of equal kind. Otherwise the remaining intervals may also match with different impact
+    counts, if both have impacts or neither has.
     """
     overlap = [
         (i, j)
@@ -274,13 +278,18 @@ def _only(fits: list[tuple[int, int]]) -> list[tuple[int, int]]:
 
 
 def _seen(count: int) -> float:
-    """How high one of so many intervals has to be, of the range, for columns to be put between; more, in a crowd."""
+    """Height, as a share of the range, above which an unmatched interval makes the search insert a column.
+
+    It grows with the number of intervals in the column.
+    """
     return 2e-4 * max(1.0, count / 8) ** 2
 
 
 def _wanted(places: list, columns: dict, width: float, height: float) -> tuple[list[float], list[tuple]]:
-    """Where columns have to be put between; and between which it is left, although intervals do not fit, or as those
-    of one of them are not known."""
+    """Return frequency ratios at which to insert columns, and the ranges that stay unresolved.
+
+    A range stays unresolved if its intervals do not match and it is too narrow to refine, or if a column has no result.
+    """
     wanted, crowded, pairs = set(), [], []
     for left, right in zip(places, places[1:]):
         if columns[left] is None or columns[right] is None:
@@ -303,7 +312,7 @@ def _wanted(places: list, columns: dict, width: float, height: float) -> tuple[l
 
 
 def _bends(places: list, columns: dict, pairs: list, width: float, height: float) -> set[float]:
-    """Where columns have to be put between, because a border is not straight."""
+    """Return frequency ratios at which to insert columns because a border is not straight."""
     wanted = set()
     for (left, here, right), (before, after) in zip(zip(places, places[1:], places[2:]), zip(pairs, pairs[1:])):
         if max(here - left, right - here) <= _CLOSE * width:
@@ -319,7 +328,7 @@ def _bends(places: list, columns: dict, pairs: list, width: float, height: float
 
 
 def _regions(places: list, columns: dict) -> list[Region]:
-    """Intervals that belong together, column after column."""
+    """Chain matching intervals, column after column."""
     open_, regions = {}, []
     for k, place in enumerate(places):
         now, before = columns[place] or [], (columns[places[k - 1]] if k else None) or []

@@ -1,10 +1,12 @@
 """Critical amplitudes and durations: all ends of the intervals in which a block overturns.
 
-Whether a block overturns is not monotonic: below the amplitude that overturns it without impact there are others
-that do so after one, three, five impacts, in ever narrower intervals, and safe gaps between them that may be narrower
-still. A bisection of the verdict finds one end of them by chance. Here the margin, its slope and the number of impacts
-at sampled points tell where something may hide between two of them, and only there the sampling is refined: for all
-ends by `ends`, and for so many of the lowest by `lowest_ends`, which stops there and may be traced.
+Overturning is not monotonic in amplitude. Below the amplitude that overturns a block without impact, others overturn it
+after one, three or five impacts. These intervals are ever narrower, and the safe gaps between them may be narrower
+still. A bisection of the verdict finds one end by chance.
+
+Here the margin, its slope and the number of impacts at sampled points tell where an end may hide between two of them.
+Only there is the sampling refined. `ends` finds all ends; `lowest_ends` finds a given number of the lowest, stops there
+and can be traced by JAX.
 """
 
 from typing import Annotated
@@ -40,20 +42,20 @@ _LEAST = 1e-12  # [g]; amplitudes are factors on a motion
 
 
 class Critical(AbstractTable):
-    """Ends of overturning intervals, in rising order; (ends,) for one scene, (scenes, ends) for many, then filled up.
+    """Ends of overturning intervals, in rising order; (ends,) for one scene, (scenes, ends) padded for many.
 
     - `count`: number of ends.
-    - `value`: amplitude [g], or duration (or period) of the motion [s]; infinite where filled up. Of a motion that
+    - `value`: amplitude [g], or duration (or period) of the motion [s]; infinite where padded. Of a motion that
       names no amplitude (a record, a sum) it is the peak: over `intensity.peak_acceleration(motion)` a factor on it.
     - `intensity`: the amplitude over the uplift threshold [-].
     - `rising`: the block overturns above this end, and not below.
     - `impacts`: before it overturns, just beside this end.
     - `balanced`: the block comes to balance at this end. If not, the verdict jumps: an impact is grazed, or the shaking
       throws it flat; such an end has no derivatives here (NaN).
-    - `complete`: whether every point that was looked at could be decided.
-    - `names`, `derivative`: (..., ends, parameters) of `value` by the other parameters of the scene; the amplitude of
-      a motion stands for its size, and is left out for critical amplitudes.
-    - `from_the_least`: whether the block overturns at the least value that was looked at already.
+    - `complete`: whether every sampled point could be decided.
+    - `names`, `derivative`: (..., ends, parameters) of `value` by the other parameters of the scene. For critical
+      amplitudes the amplitude of the motion is left out: it only stands for the motion's size.
+    - `from_the_least`: whether the block already overturns at the least value that was sampled.
     """
 
     count: Int[Array, "..."]
@@ -70,8 +72,11 @@ class Critical(AbstractTable):
     @property
     @one_program
     def lowest(self) -> Float[Array, "..."]:
-        """The least critical value above which a block overturns (over many scenes: a spectrum); infinite if none, not
-        a number where it overturns at the least that was looked at already: then it lies below."""
+        """Least critical value above which a block overturns (over many scenes: a spectrum).
+
+        Infinite if there is none. NaN where the block already overturns at the least value that was sampled: the
+        critical value lies below it.
+        """
         found = jnp.min(jnp.where(self.rising, self.value, jnp.inf), axis=-1, initial=jnp.inf)
         return jnp.where(self.from_the_least, jnp.nan, found)
 
@@ -97,22 +102,22 @@ def critical_amplitudes(
     engine: AbstractEngine | None = None,
     progress: bool | None = None,
 ) -> Critical:
-    """All amplitudes of a motion at which a block begins or ceases to overturn.
+    """Find all amplitudes of a motion at which a block begins or ceases to overturn.
 
     **Arguments:**
 
     - `block`, `motion`: one scene, or many: parameters of shape (scenes,). The amplitude of the motion plays no part.
     - `model`, `engine`: as in `outcome`.
-    - `intensity`: where to look: least and largest amplitude over the uplift threshold [-]. Below 1 nothing moves.
-    - `derivatives`: whether to find `derivative`; without, it is not a number (NaN). None: for known arguments; of
-      traced ones JAX takes derivatives of `value`, and of what is traced.
-    - `max_ends`: how many ends to look for, from the lowest on, 1 to 256; there are so many results then, filled up.
-      None: all there are, which under records takes minutes where the range is wide, also where it finds no more
-      (the bar grows with what there is still to look at); traced arguments need a number.
+    - `intensity`: search range: least and largest amplitude over the uplift threshold [-]. Below 1 nothing moves.
+    - `derivatives`: whether to compute `derivative`; without, it is NaN. None: only for concrete arguments; for traced
+      ones JAX differentiates `value` by the traced arguments.
+    - `max_ends`: number of ends to find, from the lowest on, 1 to 256; results are padded to that number. None: all
+      ends. Under records and over wide ranges this takes minutes, even if no more ends are found (the progress bar
+      grows with the intervals still to be searched). Traced arguments need a number.
     - `progress`: as in `rocking_spectrum`.
 
-    **Returns:** a `Critical`. Intervals of overturning that are much narrower than the sampling and give no sign of
-    themselves beside them may be missed; a safe gap between different numbers of impacts is not.
+    **Returns:** a `Critical`. An overturning interval may be missed if it is much narrower than the sampling and leaves
+    no trace in the margins beside it. A safe gap between different numbers of impacts is not missed.
     With traced arguments (within `jax.jit`, `jax.vmap`, `jax.grad`) it is a plain function of arrays.
 
     **Raises:** ValueError for arguments outside their ranges.
@@ -123,7 +128,7 @@ def critical_amplitudes(
     block, motion = in_real_numbers(block, motion)
     model = current_model(model, block, motion)
     scenes = _Scenes.of(block, motion, model)
-    # Dense where the least amplitudes are: overturning intervals crowd towards the threshold.
+    # Overturning intervals crowd towards the threshold, so the sampling is dense at the least amplitudes.
     grid = np.concatenate([[low], low + (high - low) * np.geomspace(1e-4, 1.0, _FIRST)])
     grid = np.log(grid) + if_traced(scenes.least)[:, None]
     return _critical(scenes, grid, Amplitude(model, engine), derivatives, max_ends, progress)
@@ -141,12 +146,12 @@ def critical_durations(
     engine: AbstractEngine | None = None,
     progress: bool | None = None,
 ) -> Critical:
-    """All durations of a motion of given amplitude at which a block begins or ceases to overturn.
+    """Find all durations of a motion of given amplitude at which a block begins or ceases to overturn.
 
     **Arguments:**
 
     - `block`, `motion`, `model`, `derivatives`, `max_ends`, `engine`, `progress`: as in `critical_amplitudes`.
-    - `factor`: where to look: least and largest duration over that of `motion` [-], all times stretched alike.
+    - `factor`: search range: least and largest duration over that of `motion` [-]; all times are stretched alike.
 
     **Returns:** a `Critical`; `value` is the duration of the whole motion [s].
     With traced arguments (within `jax.jit`, `jax.vmap`, `jax.grad`) it is a plain function of arrays.
@@ -172,7 +177,7 @@ def _rising(name: str, ends: tuple[float, float]) -> tuple[float, float]:
 
 
 class _Scenes(eqx.Module):
-    """Many scenes: parameters of shape (scenes,), samples of a record as they are."""
+    """Many scenes: numbers have shape (scenes,), and samples of a record are shared by all."""
 
     both: PyTree  # block and motion
     threshold: Float[Array, " scenes"]  # [g]
@@ -203,7 +208,7 @@ class _Scenes(eqx.Module):
 
 @quickly(eqx.filter_jit)
 def _facts(both: PyTree, model: AbstractEquation, size: int) -> tuple[Array, Array, Array, Array]:
-    """Threshold, peak and amplitude of so many scenes, and the least factor of their motions that moves them."""
+    """Threshold, peak and amplitude of `size` scenes, and the log of the least factor that moves the block."""
 
     def one(index):
         block, motion = one_of_many(both, index)
@@ -214,13 +219,13 @@ def _facts(both: PyTree, model: AbstractEquation, size: int) -> tuple[Array, Arr
 
 
 def _names(both: PyTree) -> list[str]:
-    """Of the parameters of a scene, in the order of `named`; the peak of a sum is not computed for it."""
+    """Names of the parameters of a scene, in the order of `named`, without computing the peak of a sum."""
     found = []
     jax.eval_shape(lambda both: found.extend(named(*one_of_many(both, 0))), both)
     return found
 
 
-# Of many scenes: what is asked of one point.
+# Functions of one point of one of many scenes.
 
 
 @light
@@ -243,7 +248,7 @@ def _critical(
     most: int | None,
     progress: bool | None,
 ) -> Critical:
-    """All ends, or the lowest; derivatives by the names of parameters, where they are wanted."""
+    """Find all ends, or the `most` lowest; compute derivatives if they are requested."""
     known = not is_traced((scenes, grid, kind))
     if most is None and not known:
         raise ValueError(
@@ -262,14 +267,14 @@ def _critical(
     return Critical(**(of_each(lambda x: x[0], rows) if scenes.single else rows), names=names)
 
 
-# What stands where there are fewer ends.
+# Padding values of scenes with fewer ends.
 _REST = {
     "value": np.inf, "intensity": np.inf, "rising": False, "impacts": 0, "balanced": False, "derivative": np.nan,
 }  # fmt: skip
 
 
 def _all(scenes: _Scenes, grid, kind: AbstractVaried, names: tuple[str, ...], progress) -> dict:
-    """Search, find, differentiate, and sort by scenes."""
+    """Bracket all ends, polish and differentiate them, and sort them by scene."""
 
     def run(function, z, index):
         return known_surface(function, (z, index), (kind, scenes.both), "critical", progress, outer=False)
@@ -305,23 +310,23 @@ def _all(scenes: _Scenes, grid, kind: AbstractVaried, names: tuple[str, ...], pr
 
 
 class _Wanted(eqx.Module):
-    """Known when a program is traced."""
+    """Static settings of a program: names of the derivatives, and the number of ends."""
 
     names: tuple[str, ...] = eqx.field(static=True)
     most: int = eqx.field(static=True)
 
 
 def _lowest(scenes: _Scenes, grid, kind: AbstractVaried, names: tuple[str, ...], most: int, progress) -> dict:
-    """So many of every scene; many scenes are the points of a surface."""
+    """Find the `most` lowest ends of every scene; many scenes are the points of a surface."""
     scene = _Wanted(names, most), kind, scenes, grid
-    if scenes.single:  # a surface would fill up its lanes
+    if scenes.single:  # a surface would pad one scene to a full chunk of lanes
         return jax.tree.map(lambda x: x[None], _lowest_of_one(0, scene))
     return surface(_lowest_of_one, (jnp.arange(grid.shape[0]),), scene, "critical", progress)
 
 
 @quickly(follows_scenes=True)
 def _lowest_of_one(index, scene) -> dict:
-    """Ends are found without derivatives, and get those of the implicit function."""
+    """Find ends without derivatives, then attach those of the implicit function."""
     wanted, kind, scenes, grid = scene
     block, motion = one_of_many(scenes.both, index)
     known, *place = jax.lax.stop_gradient((kind, block, motion))

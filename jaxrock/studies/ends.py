@@ -1,8 +1,9 @@
-"""The ends of intervals along lines: where a margin passes through zero, also twice between two sampled points.
+"""Ends of overturning intervals along lines: zeros of the margin, even two of them between two sampled points.
 
-The margin, its slope and the number of impacts at sampled points tell where an end may hide, and only there the
-sampling is refined. Many lines are searched at once; what is asked of each round goes out in one batch. What a search
-of traced arrays (`lowest_ends`) has in common with it takes `numbers`, which is numpy here and jax.numpy there.
+The margin, its slope and the number of impacts at sampled points tell where an end may hide, and only there is the
+sampling refined. Many lines are searched at once, with one batch of points per round.
+
+`lowest_ends` searches traced arrays with the functions of this module that take `numbers`: numpy here, jax.numpy there.
 """
 
 from collections.abc import Callable
@@ -19,12 +20,13 @@ _BALANCED = 1e-6, 2e4  # margin at an end where the block comes to balance: so m
 
 
 def brackets_of(at: Callable, grid: np.ndarray) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
-    """Intervals with one end each; and for every scene whether all points could be decided (`complete`), and whether it
-    overturns at the first (`from_the_least`).
+    """Return intervals with one end each, and per scene `complete` and `from_the_least`.
 
-    An interval is halved where the verdict changes, until that is all that happens in it; and where an end may hide:
-    the margin's tangents meet beyond zero or near it, or both sides overturn after different numbers of impacts (there
-    may be a gap between them). Where the margin is not smooth it is halved some times for good measure.
+    `complete`: every point could be decided. `from_the_least`: the scene overturns at the first point.
+
+    An interval is halved at most `_ROUGH` times where the verdict changes or the margin is not smooth. It is halved
+    further, at most `_DEEP` times, where an end may hide: the margin's tangents meet beyond zero or near it, or both
+    sides overturn after different numbers of impacts (there may be a gap between them).
     """
     scenes, points = grid.shape
     index = np.repeat(np.arange(scenes), points)
@@ -48,9 +50,9 @@ def brackets_of(at: Callable, grid: np.ndarray) -> tuple[dict[str, np.ndarray], 
 
 
 def halved(numbers: ModuleType, sides: Sides, values: tuple, depth) -> tuple:
-    """Both halves of every interval, the left ones first, from what was found at its middle.
+    """Return both halves of every interval, left halves first, from the values at its middle.
 
-    **Returns:** their sides and depths; and whether there is one end in each, or it is to be halved again.
+    **Returns:** their sides and depths; whether a half contains exactly one end; whether to halve it again.
     """
     (left, right), (low, high), (rise, fall) = sides[:3]
     guess = (low + high) / 2 + (rise - fall) * (right - left) / 8  # cubic through both values and slopes
@@ -67,7 +69,7 @@ def halved(numbers: ModuleType, sides: Sides, values: tuple, depth) -> tuple:
 
 
 def _may_hide(numbers: ModuleType, z, margin, slope, impacts):
-    """Whether the margin may pass through zero twice between two points at which it has the same sign."""
+    """Return whether the margin may pass through zero twice between two points at which it has one sign."""
     width, sign = z[1] - z[0], numbers.where(margin[0] < 0, -1.0, 1.0)
     low, high, rise, fall = sign * margin[0], sign * margin[1], sign * slope[0], sign * slope[1]
     dips = (rise < 0) & (fall > 0)
@@ -79,8 +81,10 @@ def _may_hide(numbers: ModuleType, z, margin, slope, impacts):
 
 
 def roots_of(at: Callable, brackets: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """The end in every bracket to rounding, by Newton's method, which bisection keeps within it; and whether all points
-    on the way could be decided (`known`)."""
+    """Find the end in every bracket to rounding, by Newton's method safeguarded by bisection.
+
+    `known` in the result: all points on the way could be decided.
+    """
     index, sides = brackets["index"], [brackets[name].copy() for name in ("z", "margin", "slope", "impacts")]
     columns, known = np.arange(index.size), np.ones(index.size, bool)
     for count in range(MOST_POINTS):
@@ -97,34 +101,34 @@ def roots_of(at: Callable, brackets: dict[str, np.ndarray]) -> dict[str, np.ndar
     return {"index": index, "known": known} | ends_of(np, sides)
 
 
-MOST_POINTS = 120  # to close a bracket
+MOST_POINTS = 120  # evaluations to close a bracket
 
 
 def is_wide(numbers: ModuleType, sides: Sides):
-    """Whether a bracket is wider than rounding."""
+    """Return whether a bracket is wider than rounding."""
     low, high = sides[0]
     return high - low > _TIGHT * _rounding(sides) * numbers.maximum(1.0, numbers.maximum(abs(low), abs(high)))
 
 
 def _rounding(sides: Sides) -> float:
-    """Of margins: points may be known better."""
+    """Return the machine epsilon of the margins, whose type may be less precise than that of the points."""
     return float(np.finfo(sides[1].dtype).eps)
 
 
 def next_point(numbers: ModuleType, sides: Sides, count):
-    """Where to look next in each bracket, after so many points."""
+    """Return the next point to evaluate in each bracket, after `count` points: a Newton step, or the middle."""
     z, margin, slope = sides[:3]
     near = abs(margin[1]) < abs(margin[0])
     best, value, rate = (numbers.where(near, x[1], x[0]) for x in (z, margin, slope))
     step = -value / numbers.where(rate == 0, numbers.inf, rate)
-    # A little too far, so that the bracket closes from both sides.
+    # A Newton step goes slightly too far, so that the bracket closes from both sides.
     trial = best + 1.05 * step + numbers.copysign(_TIGHT / 4 * _rounding(sides), step)
     inside = (trial > z[0]) & (trial < z[1]) & (count % 4 != 3)
     return numbers.where(inside, trial, z.mean(axis=0))
 
 
 def ends_of(numbers: ModuleType, sides: Sides) -> dict[str, Any]:
-    """What is told of the ends in closed brackets: `safe` is the side on which the block stands."""
+    """Describe the ends in closed brackets; `safe` is the side on which the block stands."""
     z, margin, _, impacts = sides
     least, often = _BALANCED
     rising = ~(margin[0] < 0)  # zero is safe

@@ -1,7 +1,7 @@
-"""The lowest ends of one line, as `ends` finds all of many: a plain function of arrays, for traced ones.
+"""The lowest ends of one line, as a plain function of arrays that can be traced (`ends` finds all ends of many lines).
 
-How many ends there are is not known before, so it is said how many are wanted. Intervals wait in line, the lowest
-first; some of them at a time are halved, until the wanted ends are found or none may hide any more.
+The number of ends is unknown at trace time, so the caller gives the number wanted. Intervals wait in a queue, the
+lowest first. A few at a time are halved, until the wanted ends are found or no interval can hide another.
 """
 
 from collections.abc import Callable
@@ -14,36 +14,36 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxrock.studies.ends import MOST_POINTS, Sides, ends_of, halved, is_wide, next_point
 
 _AT_A_TIME = 32  # intervals
-_ROOM = 1024  # intervals that wait; each that is taken leaves two at most, and those are taken next
+_ROOM = 1024  # capacity of the queue; each interval taken leaves at most two, which are taken next
 
 
 class _Line(NamedTuple):
-    """Intervals in rising order."""
+    """Queue of intervals, in rising order."""
 
     sides: Sides
     depth: Int[Array, " n"]
     here: Bool[Array, " n"]  # whether there is one
 
     def first(self, count: int) -> "_Line":
-        """So many of them, from the left; where there are fewer, places are empty."""
+        """Return the first `count` intervals from the left; missing ones are empty places."""
         order = jnp.argsort(jnp.where(self.here, self.sides[0][0], jnp.inf), stable=True)[:count]
         return _Line([x[:, order] for x in self.sides], self.depth[order], self.here[order])
 
     def part(self, begin: int, end: int) -> "_Line":
-        """Some of them."""
+        """Return the intervals from `begin` to `end`."""
         return jax.tree.map(lambda x: x[..., begin:end], self)
 
     def followed_by(self, other: "_Line") -> "_Line":
-        """Both, in no order."""
+        """Concatenate both queues, without sorting."""
         return jax.tree.map(lambda a, b: jnp.concatenate([a, b], axis=-1), self, other)
 
 
 def lowest_ends(at: Callable, grid: Float[Array, " points"], most: int) -> dict[str, Any]:
-    """The `most` lowest ends, without derivatives.
+    """Find the `most` lowest ends, without derivatives.
 
-    `at`: margin, its slope and impacts at one point. **Returns:** what `ends_of` tells of each, with `found`, whether
-    there is one, `complete`, whether every point that was looked at could be decided, and `from_the_least`, whether it
-    overturns at the first.
+    `at`: margin, its slope and impacts at one point. **Returns:** the fields of `ends_of` for each end, and three
+    flags. `found`: the place holds an end; `complete`: every sampled point could be decided; `from_the_least`: the
+    scene overturns at the first point.
     """
     many = jax.vmap(at)
     values = (grid, *many(grid))
@@ -76,7 +76,7 @@ def lowest_ends(at: Callable, grid: Float[Array, " points"], most: int) -> dict[
 
 
 def _closed(many: Callable, sides: Sides, here: Bool[Array, " n"], elsewhere: Float[Array, ""]) -> tuple[Sides, Array]:
-    """Brackets as narrow as rounding; and whether every point on the way could be decided."""
+    """Narrow brackets to rounding; also return whether every point on the way could be decided."""
 
     def is_open(sides):
         return here & is_wide(jnp, sides)

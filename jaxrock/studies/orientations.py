@@ -1,11 +1,12 @@
 """Orientational analysis: which products of quantities have neither a dimension nor an orientation.
 
-A quantity points along x, y or z, or nowhere: a displacement or an acceleration along its axis, an angle in the x-y
-plane along z. Two equal orientations cancel, two unlike ones make the third. So an equation must hold in orientations,
-too: mirrored scenes give mirrored answers. That is a rule for exponents of angles, which have no dimension.
+A quantity points along x, y or z, or has no orientation: a displacement or an acceleration points along its axis, an
+angle in the x-y plane along z. Two equal orientations cancel, two unlike ones make the third. An equation must also be
+consistent in orientations: mirrored scenes give mirrored answers. This constrains exponents of angles, which have no
+dimension.
 
-It tells which groups may be used, not which the response depends on: a slender block's response is unchanged if all
-angles and accelerations grow alike, which no orientation knows.
+The analysis tells which groups may be used, not which the response depends on. A slender block's response, for example,
+is unchanged if all angles and accelerations grow alike, which no orientation expresses.
 
 **Source:** Siano (1985); Dimitrakopoulos & DeJong (2012), section 4, equations 4.4 to 4.9 and table 1.
 """
@@ -39,11 +40,11 @@ class Quantity(NamedTuple):
 
     @property
     def is_pure(self) -> bool:
-        """Whether it is a number without an orientation: one that equal scenes may share."""
+        """True for a number without an orientation: a group that similar scenes can share."""
         return self == Quantity()
 
 
-# Of a block that rocks in the x-y plane, y upwards: D&D 4.7.
+# Quantities of a block that rocks in the x-y plane, y upwards: D&D 4.7.
 QUANTITIES = {
     "rotation": Quantity(orientation="z"),
     "alpha": Quantity(orientation="z"),
@@ -59,9 +60,9 @@ QUANTITIES = {
 
 
 def combined(first: str, second: str) -> str:
-    """The orientation of a product of two quantities with these orientations.
+    """Return the orientation of a product of two quantities with these orientations.
 
-    **Raises:** ValueError for what is none of "0", "x", "y" and "z".
+    **Raises:** ValueError for anything but "0", "x", "y" and "z".
 
     **Source:** Dimitrakopoulos & DeJong (2012), equation 4.4 and table 1.
     """
@@ -71,9 +72,9 @@ def combined(first: str, second: str) -> str:
 
 
 def power(orientation: str, exponent: int) -> str:
-    """The orientation of a whole power: its own if that is odd, none if it is even.
+    """Return the orientation of a whole power: the quantity's own if the exponent is odd, "0" if it is even.
 
-    **Raises:** ValueError for an exponent that is not whole: of a root of a square nothing tells which it is.
+    **Raises:** ValueError for an exponent that is not whole: the orientation of the root of a square is undetermined.
 
     **Source:** Dimitrakopoulos & DeJong (2012), equation 4.5.
     """
@@ -82,11 +83,11 @@ def power(orientation: str, exponent: int) -> str:
 
 
 def of_series(orientation: str, exponents: Iterable[int]) -> str:
-    """The orientation of a power series of a quantity that has terms with these exponents.
+    """Return the orientation of a power series of a quantity that has terms with these exponents.
 
     **Returns:** that of its terms: "0" for the cosine of an angle, whose terms are even, the angle's own for its sine.
 
-    **Raises:** ValueError where the terms differ, as those of an exponential: such a sum means nothing.
+    **Raises:** ValueError where the terms differ, as those of an exponential: such a sum has no orientation.
 
     **Source:** Dimitrakopoulos & DeJong (2012), equation 4.6.
     """
@@ -97,7 +98,7 @@ def of_series(orientation: str, exponents: Iterable[int]) -> str:
 
 
 def product(**exponents: int) -> Quantity:
-    """Dimension and orientation of a product of powers of the block's and the motion's quantities.
+    """Return dimension and orientation of a product of powers of the block's and the motion's quantities.
 
     **Arguments:**
 

@@ -1,4 +1,4 @@
-"""The parameters of a scene by name: what derivatives are taken by, and what is fitted."""
+"""Parameters of a scene by name, for derivatives and fits."""
 
 import operator
 from collections import Counter
@@ -47,27 +47,30 @@ def named(block: AnyBlock, motion: AbstractMotion) -> dict[str, Real]:
 
 
 def amplitude_of(motion: AbstractMotion) -> Real:
-    """The amplitude that a motion names, or its peak [g]."""
+    """Return the amplitude that a motion declares, or its peak [g]."""
     own = [as_array(leaf.value) for leaf in _numbers(motion) if leaf.name == "amplitude"]
     return own[0] if own else peak_of(motion)
 
 
 def peak_of(motion: AbstractMotion) -> Real:
-    """Peak acceleration [g], also where the bound that a motion tells lies above it: of a sum, which may be far below
-    what its parts add up to, of a pulse whose amplitude is not its peak, and of motions of the user's own."""
+    """Return the peak acceleration [g], even where the bound that a motion declares lies above it.
+
+    The bound is loose for a sum, whose peak may be far below the sum of its parts. It is loose, too, for a pulse whose
+    amplitude is not its peak, and for motions of the user's own.
+    """
     parts = jax.tree.leaves(motion, is_leaf=_is_loose)
     return peaks_of_motion(motion)[0] if any(map(_is_loose, parts)) else peak_bound(motion)
 
 
 def _is_loose(part) -> bool:
-    """Whether the bound of a motion may lie above its peak."""
+    """Return whether the declared bound of a motion may lie above its peak."""
     if not isinstance(part, AbstractMotion):
         return False
     return isinstance(part, Summed | MavroeidisPapageorgiouPulse) or not is_ours(part)
 
 
 def declarations(block: AnyBlock, motion: AbstractMotion) -> dict[str, Parameter]:
-    """What is declared of the parameters that `named` names."""
+    """Return the declarations of the parameters that `named` names."""
     found = dict(_declared(block))
     own = {leaf.name: leaf.declared for leaf in _of_own(block)}
     if own:
@@ -82,11 +85,12 @@ def declarations(block: AnyBlock, motion: AbstractMotion) -> dict[str, Parameter
 def rebuilt(
     block: AnyBlock, motion: AbstractMotion, values: dict[str, Real], amplitude: Real | None = None
 ) -> tuple[AnyBlock, AbstractMotion]:
-    """The scene with other values of its parameters, and derivatives by them; `amplitude`: that of the motion as it is,
-    where it is known.
+    """Rebuild the scene with other values of its parameters, differentiable by them.
 
-    What follows from other parameters goes on doing so (a restitution, from alpha): its value then is what is added to
-    one of its own.
+    `amplitude`: the amplitude of the motion as it is, where it is known.
+
+    A value that follows from other parameters (a restitution, from alpha) goes on following them: the difference
+    between its new value and its present one is added to it.
     """
     return _rebuilt_block(block, values), _rebuilt_motion(motion, values, amplitude)
 
@@ -133,12 +137,12 @@ def scaled(motion: AbstractMotion, factor: Real) -> AbstractMotion:
 
 
 def _declared(block: AnyBlock) -> dict[str, Parameter]:
-    """The same by the names of the parameters."""
+    """Return the declared parameters of a block by the names of the parameters."""
     return {known.follows or field: known for field, known in declared(type(block)).items()}
 
 
 def _of_own(block: AnyBlock) -> list[Leaf]:
-    """Parameters of a law of restitution that is more than one number for each side."""
+    """Return parameters of a law of restitution that is more than one number for each side."""
     if isinstance(block.law, Constant) or (isinstance(block.law, PerSide) and isinstance(block, AsymmetricBlock)):
         return []
     return [
@@ -147,7 +151,7 @@ def _of_own(block: AnyBlock) -> list[Leaf]:
 
 
 def _of_law(block: AnyBlock) -> dict[str, Real]:
-    """Parameters of the restitution; none of a law without numbers that is not one for each side either."""
+    """Return parameters of the restitution; none for a law without numbers that is not one number for each side."""
     own = _of_own(block)
     if own:
         return {leaf.name: as_array(leaf.value) for leaf in own}
@@ -162,8 +166,11 @@ def _of_law(block: AnyBlock) -> dict[str, Real]:
 
 
 def _numbers(motion: AbstractMotion) -> list[Leaf]:
-    """The single numbers of a motion; of one that is scaled or shifted the factor and the amplitude of the pulse in it
-    are left out, for its own amplitude says the same."""
+    """Return the single numbers of a motion.
+
+    For a scaled or shifted motion, the factor and the amplitude of the inner pulse are left out: the amplitude of the
+    whole motion replaces them.
+    """
     inner, place = motion, ""
     while isinstance(inner, Scaled | Shifted):
         inner, place = inner.motion, f"{place}motion."

@@ -1,4 +1,4 @@
-"""Outcomes in the files and stores of sweeps: `Grid.load` knows them again by the names of their results."""
+"""Registration of `Outcome`, so that `Grid.load` recognises outcomes in saved files by the names of their results."""
 
 import jax.numpy as jnp
 
@@ -8,7 +8,7 @@ from jaxrock.sweeps.grid import known_again
 
 
 def an_outcome() -> Outcome:
-    """An outcome of any numbers."""
+    """Return an outcome with arbitrary numbers."""
     number, count, verdict = jnp.zeros(()), jnp.zeros((), int), jnp.zeros((), bool)
     return Outcome(
         max_rotation=number, max_velocity=number, time_of_max=number, impact_count=count, overturned=verdict,

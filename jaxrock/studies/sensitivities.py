@@ -1,4 +1,4 @@
-"""How a response depends on the parameters of its scene, and how far that can be trusted."""
+"""Sensitivity of a response to the parameters of its scene, and how far derivatives can be trusted."""
 
 import equinox as eqx
 import jax
@@ -31,7 +31,7 @@ Scalar = Inexact[Array, "..."]
 
 
 class SlopeStatus(Enumeration):
-    """Whether slopes can be followed; `SlopeStatus[found.margin.status]` is the message."""
+    """Status of slopes; `SlopeStatus[found.margin.status]` is the message."""
 
     useful = item("A linear step says what comes of changes that are much smaller than `reach`.")
     useless = item(
@@ -45,14 +45,14 @@ class SlopeStatus(Enumeration):
 
 
 class Slopes(eqx.Module):
-    """How one result depends on the parameters.
+    """Derivatives of one result by the parameters.
 
     - `value`: the result.
     - `derivative`: (..., parameters) partial derivatives, in the units of the result over those of the parameters.
     - `elasticity`: (..., parameters) per cent of the result per cent of the parameter, d ln y/d ln x.
-    - `reach`: relative change of the parameters (of all together, in the steepest direction) that to first order
-      changes the result by all of its range: by itself, the margin by 1 at least. Linear steps must stay far below it;
-      infinite where all slopes are zero, NaN where there are none.
+    - `reach`: relative change of all parameters together, in the steepest direction, that changes the result by all of
+      its range to first order: by its own value, the margin by at least 1. Linear steps must stay far below it.
+      Infinite where all slopes are zero, NaN where there are none.
     - `status`: a `SlopeStatus`.
     """
 
@@ -66,18 +66,18 @@ class Slopes(eqx.Module):
 
 
 class Sensitivity(AbstractTable):
-    """What `sensitivity` finds.
+    """Result of `sensitivity`.
 
     - `names`, `values`: the parameters; the last, where the motion is a pulse or a record, is `uplift_strength`.
     - `max_rotation`, `max_velocity`, `margin`: `Slopes` of [rad], [rad/s], [-].
     - `outcome`: the response itself.
     - `valid`: whether the derivatives of `max_rotation` describe the response: computed, not overturned, and smooth
-      here (`Outcome.differentiable`). Where it is false they are not numbers (NaN).
-    - `condition`: length of the vector of elasticities of `max_rotation`: relative errors grow by up to that much.
-    - `graze_distance`: relative change of the parameters (of all together, in the worst direction, to first order) that
-      makes a grazing impact appear or vanish before the peak, and with it changes the number of impacts; infinite if
-      the block has been far from any graze, NaN where the response was not computed, or has no slope.
-    - `boundary_distance`: the same for overturning, or for not overturning: margin over its slope.
+      here (`Outcome.differentiable`). Where it is false they are NaN.
+    - `condition`: length of the vector of elasticities of `max_rotation`: relative errors grow by at most that factor.
+    - `graze_distance`: relative change of all parameters together, in the worst direction and to first order, that
+      makes a grazing impact appear or vanish before the peak. This changes the number of impacts. Infinite if the block
+      stays far from any graze, NaN where the response was not computed or has no slope.
+    - `boundary_distance`: relative change that overturns the block, or saves an overturned one: margin over its slope.
     """
 
     names: tuple[str, ...] = eqx.field(static=True)
@@ -97,7 +97,7 @@ class Sensitivity(AbstractTable):
 
 
 def _table(found: Sensitivity, axes: tuple[str, ...]) -> dict[str, Column]:
-    """Results over the axes of scenes, their slopes over those and the parameters."""
+    """Return results over the axes of scenes, and their slopes over those axes and the parameters."""
     over = (*axes, "parameter")
     told = {"parameter": Column(("parameter",), found.names), "at": Column(over, found.values, _OWN)}
     for name, unit in {"max_rotation": "rad", "max_velocity": "rad/s", "margin": "-"}.items():
@@ -113,7 +113,7 @@ def _table(found: Sensitivity, axes: tuple[str, ...]) -> dict[str, Column]:
 
 
 _OWN = "that of the parameter"
-_USELESS = 1e-3  # the reach below which slopes are: parameters of no block, and of no earthquake, are known as well
+_USELESS = 1e-3  # reach below which slopes are useless: no parameter of a block or an earthquake is known so well
 _RESULTS = ("max_rotation", "max_velocity", "margin", "clearance")
 
 
@@ -125,16 +125,16 @@ def sensitivity(
     *,
     engine: AbstractEngine | None = None,
 ) -> Sensitivity:
-    """Derivatives and elasticities of a response by every parameter of its scene, and where they end.
+    """Compute derivatives and elasticities of a response by every parameter of its scene, and their limits.
 
     **Arguments:**
 
     - `block`, `motion`, `model`, `engine`: as in `outcome`; under `jax.vmap` for many scenes.
 
-    **Returns:** a `Sensitivity`. Derivatives are partial: `alpha` with the restitution following it if that is
-    Housner's, but at a fixed amplitude [g]; `amplitude` of a record scales all of it; `uplift_strength`, the uplift
-    threshold over the amplitude, is changed by the amplitude. It is a plain function of arrays: `jax.jit`, `jax.vmap`
-    and further derivatives go through it.
+    **Returns:** a `Sensitivity`. Derivatives are partial. That by `alpha` includes a restitution that follows it
+    (Housner's law), at a fixed amplitude [g]. `amplitude` of a record scales all of it. `uplift_strength`, the uplift
+    threshold over the amplitude, is varied through the amplitude. The function is a plain function of arrays:
+    `jax.jit`, `jax.vmap` and further derivatives go through it.
 
     **Raises:** ValueError for arguments outside their ranges.
     """
@@ -142,7 +142,7 @@ def sensitivity(
     return _sensitivity(block, motion, current_model(model, block, motion), engine)
 
 
-@quickly(follows_scenes=True)  # one program: the operations are many
+@quickly(follows_scenes=True)  # one program, because it has many operations
 def _sensitivity(block, motion, model, engine) -> Sensitivity:
     parameters = named(block, motion)
     names, values = tuple(parameters), jnp.stack([jnp.asarray(v) for v in parameters.values()])
@@ -157,7 +157,7 @@ def _sensitivity(block, motion, model, engine) -> Sensitivity:
 
 
 def _told(names: tuple[str, ...], values, threshold, rows, result: Outcome) -> Sensitivity:
-    """What derivatives (results, parameters) at values of the parameters tell."""
+    """Build the `Sensitivity` from derivatives (results, parameters) at the values of the parameters."""
     valid = (result.status == Status.successful) & result.differentiable
     # uplift_strength = threshold/amplitude: d/d ln strength = -d/d ln amplitude.
     amplitude = values[names.index("amplitude")]
@@ -185,7 +185,7 @@ def _told(names: tuple[str, ...], values, threshold, rows, result: Outcome) -> S
         return Slopes(value, row, relative, reach, status)
 
     def distance(name, value):
-        """To first order, the relative change of all parameters together that makes a result zero."""
+        """Return, to first order, the relative change of all parameters together that makes a result zero."""
         steep = steepest(name)
         far = (steep == 0) | (value == jnp.inf)
         return jnp.where(successful, jnp.where(far, jnp.inf, jnp.abs(value) / jnp.where(far, 1.0, steep)), jnp.nan)
@@ -235,7 +235,7 @@ def sensitivity_map(
     engine: AbstractEngine | None = None,
     progress: bool | None = None,
 ) -> SensitivityMap:
-    """Sensitivities over uplift strength and pulse duration, for one shape of the exponential pulse.
+    """Compute sensitivities over uplift strength and pulse duration, for one shape of the exponential pulse.
 
     **Arguments:**
 
@@ -253,7 +253,7 @@ def sensitivity_map(
     """
     strength, duration = axis("uplift_strength", uplift_strength), axis("pulse_duration", pulse_duration)
     shape, alpha = scalar("shape", not_nan("shape", shape)), as_real("alpha", alpha)
-    block = Block(alpha, 1.0, restitution)  # raises here, where values are known
+    block = Block(alpha, 1.0, restitution)  # raises here, where values are concrete
     check_single(block=block)
     model = current_model(model, block, shape, strength, duration)
     scene = shape, block.alpha, scaled_law(block), model, engine

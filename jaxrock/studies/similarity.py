@@ -1,11 +1,12 @@
-"""Scale laws: the dimensionless and orientationless groups in which blocks and motions of all sizes are one.
+"""Scale laws: dimensionless and orientationless groups, in which blocks and motions of all sizes respond alike.
 
 The rocking of a slender block under a motion of given form, with peak a_g and frequency omega_g, depends on three
-numbers: omega_g/p, g alpha/a_g and the restitution. That of any rigid block depends on cos(alpha) besides, and on
-g tan(alpha)/a_g; as long as rotations are small, dividing them by cos(alpha) makes up for it. Why such groups have
-neither dimension nor orientation is what `orientations` computes.
+numbers: omega_g/p, g alpha/a_g and the restitution. For any rigid block g tan(alpha)/a_g replaces the second, and
+cos(alpha) is a fourth. As long as rotations are small, dividing them by cos(alpha) removes this dependence.
+`orientations` computes why such groups have neither dimension nor orientation.
 
-Of a pulse these are its uplift strength, its duration times p, and what else it has: `groups_of` and `motion`.
+The groups of a pulse are its uplift strength, its duration times p, and its further parameters: see `groups_of` and
+`motion`.
 
 **Source:** Dimitrakopoulos & DeJong (2012), sections 4 to 6; Voyagaki, Psycharis & Mylonakis (2012), 2.2.
 """
@@ -40,13 +41,13 @@ KINDS = ("slender", "rigid")
 
 
 class Groups(eqx.Module):
-    """What is the same for all blocks and motions that respond alike.
+    """Numbers that are equal for all blocks and motions that respond alike.
 
     - `frequency_ratio`: omega_g/p [-].
     - `strength`: g alpha/a_g (slender) or g tan(alpha)/a_g (rigid) [-]: one over the intensity.
     - `restitution`: [-].
     - `cos_alpha`: None for slender blocks, for which it plays no part.
-    - `others`: further parameters of a pulse by their names, times of them times p [-].
+    - `others`: further parameters of a pulse by name [-]; those that are times are multiplied by p.
     """
 
     __repr__ = described
@@ -66,13 +67,13 @@ class Groups(eqx.Module):
         cos_alpha: ArrayLike | None = None,
         **others: ArrayLike,
     ) -> "Groups":
-        """Groups by the numbers of single-lobe pulses: uplift threshold over peak, and p times the duration [-].
+        """Make groups from the numbers of single-lobe pulses: uplift threshold over peak, and p times the duration [-].
 
         **Arguments:**
 
         - `uplift_strength`, `pulse_duration`: positive.
-        - `restitution`, `cos_alpha`: as they are kept.
-        - `others`: of the pulse, such as `shape=0.5`.
+        - `restitution`, `cos_alpha`: as the fields of `Groups`.
+        - `others`: further parameters of the pulse, such as `shape=0.5`.
 
         **Raises:** ValueError for arguments outside their ranges.
 
@@ -91,7 +92,7 @@ class Groups(eqx.Module):
 
 
 class Scales(eqx.Module):
-    """What one unit of a dimensionless result is: divide by it on the way in, multiply on the way out.
+    """Units of dimensionless results: divide by them to make a result dimensionless, multiply to convert it back.
 
     - `time`: [s]; `rotation`: [rad]; `velocity`: [rad/s].
     """
@@ -105,7 +106,7 @@ class Scales(eqx.Module):
 
 @arguments
 def groups(block: Block, amplitude: ArrayLike, frequency: ArrayLike, kind: str = "rigid") -> Groups:
-    """The groups of a block under a motion.
+    """Compute the groups of a block under a motion.
 
     **Arguments:**
 
@@ -127,14 +128,14 @@ def groups(block: Block, amplitude: ArrayLike, frequency: ArrayLike, kind: str =
 
 @arguments
 def groups_of(block: Block, pulse: AbstractPulse, kind: str = "rigid") -> Groups:
-    """The groups of a block under a pulse: uplift strength, duration, and the pulse's further parameters.
+    """Compute the groups of a block under a pulse: uplift strength, duration, and the pulse's further parameters.
 
     **Arguments:**
 
     - `block`, `kind`: as in `groups`.
     - `pulse`: any pulse; the sign of its amplitude plays no part.
 
-    **Returns:** `Groups`, of which `motion` makes the pulse again, for this block or for another.
+    **Returns:** `Groups`, from which `motion` makes the pulse again, for this block or for another.
 
     **Source:** Voyagaki, Psycharis & Mylonakis (2012), 2.2; Dimitrakopoulos & DeJong (2012), 4.11 and 5.3.
     """
@@ -145,7 +146,7 @@ def groups_of(block: Block, pulse: AbstractPulse, kind: str = "rigid") -> Groups
 
 
 def _parts(form: Callable) -> tuple[list[str], dict[str, bool]]:
-    """Of a pulse: names of its amplitude and its period or duration, and of the others, with whether they are times."""
+    """Return the names of a pulse's amplitude and duration (or period); then which other parameters are times."""
     known = declared(form.func if isinstance(form, functools.partial) else form)  # type: ignore[arg-type]  # a class
     names = list(known)
     return names[:2], {name: known[name].unit == "s" for name in names[2:]}
@@ -160,7 +161,7 @@ def _check_law(block: Block) -> None:
 
 @arguments
 def block(groups: Groups, amplitude: ArrayLike, frequency: ArrayLike) -> Block:
-    """The slender block that has these groups under a motion with this peak [g] and angular frequency [rad/s].
+    """Return the slender block that has these groups under a motion with this peak [g] and angular frequency [rad/s].
 
     **Raises:** ValueError for groups of the kind "rigid", whose alpha is given: ask for the motion instead.
     """
@@ -172,16 +173,17 @@ def block(groups: Groups, amplitude: ArrayLike, frequency: ArrayLike) -> Block:
 
 @arguments
 def motion(groups: Groups, block: Block, form: Callable):
-    """The motion under which a block has these groups.
+    """Return the motion under which a block has these groups.
 
     **Arguments:**
 
     - `groups`: `Groups`.
-    - `block`: a `Block` of any size, of their restitution, and if they are of rigid blocks, of their alpha.
-    - `form`: makes a motion from peak [g] and period or duration [s], such as `SinePulse`; a pulse, where the groups
-      have others of its parameters.
+    - `block`: a `Block` of any size with the restitution of the groups and, for groups of rigid blocks, with their
+      alpha.
+    - `form`: makes a motion from peak [g] and period or duration [s], such as `SinePulse`. It must be a pulse if the
+      groups hold further parameters of one.
 
-    **Returns:** what `form` makes.
+    **Returns:** the motion that `form` makes.
 
     **Raises:** ValueError for a block that is known not to have these groups under any motion, and for a pulse without
     their other parameters.
@@ -203,14 +205,14 @@ def motion(groups: Groups, block: Block, form: Callable):
 
 @arguments
 def scales(block: Block, amplitude: ArrayLike | None = None, kind: str = "rigid") -> Scales:
-    """The units in which responses of similar blocks are one curve.
+    """Return the units in which responses of similar blocks are one curve.
 
     **Arguments:**
 
     - `block`: a `Block`.
     - `amplitude`: peak a_g of the motion [g]: rotations are measured by the motion. None: by alpha.
-    - `kind`: "slender", or "rigid": with an amplitude, rotations are also divided by cos(alpha), which makes the
-      response of blocks with different alpha nearly one as long as rotations are small.
+    - `kind`: "slender", or "rigid". With an amplitude, "rigid" also divides rotations by cos(alpha). This makes the
+      response of blocks with different alpha nearly one curve as long as rotations are small.
 
     **Returns:** `Scales`.
 
@@ -223,7 +225,7 @@ def scales(block: Block, amplitude: ArrayLike | None = None, kind: str = "rigid"
 
 @arguments
 def master_curve(response: Response, scales: Scales, dimensionless_time: ArrayLike) -> tuple[Real, Real]:
-    """Rotation and velocity of a response in dimensionless terms.
+    """Return rotation and velocity of a response in dimensionless terms.
 
     **Arguments:**
 

@@ -1,4 +1,4 @@
-"""Whole surfaces: rocking spectra and overturning maps."""
+"""Rocking spectra and overturning maps."""
 
 import functools
 import math
@@ -82,7 +82,7 @@ class OverturningMap(AbstractTable):
     - `state`: 0 safe, 1 overturned without impact, 2 overturned after impacts, -1 not computed (see `status`).
     - `max_rotation`: peak |rotation| over alpha [-]; infinite where the block overturned.
     - `impact_count`, `margin`, `status`: as in `Outcome`.
-    - `scene`: what was shaken, and how, for `overturning_borders`.
+    - `scene`: block, restitution, pulse, model and engine of the map, for `overturning_borders`.
     """
 
     frequency_ratio: Float[Array, " columns"]
@@ -127,7 +127,7 @@ def rocking_spectrum(
     engine: AbstractEngine | None = None,
     progress: bool | None = None,
 ) -> Spectrum:
-    """Peak response of blocks of one slenderness and every size under one motion.
+    """Compute the peak response of blocks of one slenderness and every size under one motion.
 
     **Arguments:**
 
@@ -145,7 +145,7 @@ def rocking_spectrum(
     **Source:** Makris & Konstantinidis (2003), the rocking spectrum.
     """
     period = axis("period", period, _period)
-    block = of_any_size(alpha, restitution)  # raises here, where values are known
+    block = of_any_size(alpha, restitution)  # raises here, where values are concrete
 
     scene = block.alpha, block.law, motion, current_model(model, block, motion, period), engine
     return Spectrum(period, **surface(_under_motion, (period,), scene, "spectrum", progress, names=_PEAKS))
@@ -166,19 +166,19 @@ def self_similar_spectrum(
     progress: bool | None = None,
     **parameters: Values,
 ) -> Spectrum:
-    """Peak response under a pulse against its frequency, in dimensionless terms: one curve per intensity.
+    """Compute the peak response under a pulse against its frequency, in dimensionless terms: one curve per intensity.
 
     **Arguments:**
 
     - `frequency_ratio`: (n,) values of omega/p [-], positive, omega = 2 pi/period of the pulse.
-    - `intensity`: (rows,) peak acceleration over the uplift threshold [-], positive. What is taken for the peak is the
-      pulse's `amplitude`: of a `MavroeidisPapageorgiouPulse`, and a `RickerPulse` with a `center` of its own, the peak
-      is lower (`rk.intensity.peak_acceleration`).
-    - `pulse_duration`, `uplift_strength`: (n,) and (rows,) the same axes in other numbers, each in place of one of the
-      two: p times the duration (or period) of the pulse, and uplift threshold over peak acceleration [-], positive.
+    - `intensity`: (rows,) peak acceleration over the uplift threshold [-], positive. The pulse's `amplitude` counts as
+      the peak. The peak of a `MavroeidisPapageorgiouPulse`, and of a `RickerPulse` with a `center` of its own, is lower
+      (`rk.intensity.peak_acceleration`).
+    - `pulse_duration`, `uplift_strength`: (n,) and (rows,) alternatives to these two axes, positive: p times the
+      duration (or period) of the pulse [-], and uplift threshold over peak acceleration [-].
     - `alpha`, `restitution`: of the block. In the linear model alpha plays no part.
-    - `pulse`: makes a motion from amplitude [g] and period [s] (for pulses with a duration, that): a pulse of the
-      package, or any function that JAX can trace; what it reads may have changed since the last call.
+    - `pulse`: makes a motion from amplitude [g] and period (or duration, for pulses that have one) [s]: a pulse of the
+      package, or any function that JAX can trace. The values that it reads may have changed since the last call.
     - `model`, `engine`, `progress`: as in `rocking_spectrum`.
     - `parameters`: further ones of the pulse by their names, such as `shape=0.5`: a number, or a list, which is one
       more axis, in front of the others.
@@ -211,7 +211,7 @@ def overturning_map(
     progress: bool | None = None,
     **parameters: Values,
 ) -> OverturningMap:
-    """Who overturns under a pulse, over its frequency and intensity.
+    """Compute which blocks overturn under a pulse, over its frequency and intensity.
 
     **Arguments:** as in `self_similar_spectrum`.
 
@@ -240,7 +240,7 @@ class _PulseAxes(NamedTuple):
 
     @classmethod
     def of(cls, frequency_ratio, intensity, pulse_duration, uplift_strength, parameters) -> "_PulseAxes":
-        """Each of the two from the one of its names that is given."""
+        """Make each of the two axes from whichever of its two arguments is given."""
         ratio = _either("frequency_ratio", frequency_ratio, "pulse_duration", pulse_duration, 2 * math.pi)
         intensity = _either("intensity", intensity, "uplift_strength", uplift_strength, 1.0)
         parameters = {name: not_nan(name, values) for name, values in parameters.items()}
@@ -251,12 +251,12 @@ class _PulseAxes(NamedTuple):
 
     @property
     def lists(self) -> dict[str, Array]:
-        """The parameters that are axes."""
+        """Parameters that are lists, and so axes."""
         return {name: values for name, values in self.parameters.items() if values.ndim}
 
 
 def _either(name: str, values: Values | None, other: str, others: Values | None, product: float) -> Float[Array, " n"]:
-    """An axis, given by itself or by what it makes a number with."""
+    """Return an axis from its own argument, or from another one as `product` over that."""
     if values is not None and others is None:
         return axis(name, values)
     if others is not None and values is None:
@@ -266,7 +266,7 @@ def _either(name: str, values: Values | None, other: str, others: Values | None,
 
 
 def _scene(axes: _PulseAxes, alpha, restitution, pulse, model, engine) -> tuple:
-    """What is the same at all points: a pytree, with the parameters of the pulse that are numbers."""
+    """Return the part that all points share: a pytree, which holds the scalar parameters of the pulse."""
     block, lists = of_any_size(alpha, restitution), tuple(axes.lists)
     numbers = {name: value for name, value in axes.parameters.items() if name not in lists}
     number = jax.ShapeDtypeStruct((), jnp.result_type(block.alpha, *axes.parameters.values(), *axes[:2]))
@@ -275,7 +275,7 @@ def _scene(axes: _PulseAxes, alpha, restitution, pulse, model, engine) -> tuple:
 
 
 class _Family(eqx.Module):
-    """Pulses of some size and extent, with parameters that are numbers, and others that are listed at each point."""
+    """A family of pulses by size and extent: some parameters are fixed numbers, others are given at each point."""
 
     pulse: UserFunction | ByIdentity
     numbers: dict[str, Array]
@@ -290,13 +290,15 @@ def _over_pulses(
 ) -> dict[str, Any]:
     """Outcomes over the outer product of parameters, intensities (rows) and frequency ratios (columns), at p = 1."""
     points = (*axes.lists.values(), axes.intensity, axes.ratio)
-    # Neighbours in intensity share a chunk: they move alike.
+    # Points that are neighbours in intensity share a chunk, because they move alike.
     return surface(_under_pulse, points, scene, label, progress, columns=True, names=names)
 
 
 def of_any_size(alpha: ArrayLike, restitution: Restitution | None) -> Block:
-    """A block that stands for those of every size; the same one for the same plain numbers, because to make it takes a
-    quarter of the time of a small map."""
+    """Return a block that stands for blocks of every size, cached for plain numbers.
+
+    Making it takes a quarter of the time of a small map.
+    """
     if isinstance(alpha, float) and isinstance(restitution, float | None):
         return _of_plain_numbers(alpha, restitution, jnp.result_type(float))
     return Block(alpha, 1.0, restitution)
@@ -308,7 +310,7 @@ def _of_plain_numbers(alpha: float, restitution: float | None, precision: np.dty
 
 
 def scaled_law(block: Block) -> AbstractRestitution:
-    """The restitution of a block that stands for those of every size; ValueError, if it is not the same for all."""
+    """Return the restitution of a block of any size; ValueError if it depends on the speed of impacts."""
     if block.law.depends_on_speed:
         raise ValueError("Argument `restitution` must not depend on the speed of impacts, where size plays no part.")
     return block.law
@@ -318,7 +320,7 @@ _period = Range("be positive and finite, from 1e-5 to 1e6", 0.0, np.inf, lambda 
 
 
 def axis(name: str, values: Values, allowed: Range = ratio) -> Float[Array, " n"]:
-    """A list of numbers in a range, as an array."""
+    """Return a list of numbers in a range as an array."""
     array = allowed(name, values)
     array = array if array.ndim else array.reshape(1)
     if array.ndim != 1 or array.size == 0:
@@ -326,20 +328,20 @@ def axis(name: str, values: Values, allowed: Range = ratio) -> Float[Array, " n"
     return array
 
 
-# What a surface keeps of an outcome: computed with it, point by point, and alike for spectra and maps, so that a
-# spectrum and a map of one pulse are one program.
+# Results of an outcome that a surface keeps. They are computed with it, point by point. Spectra and maps compute the
+# same ones, so a spectrum and a map of one pulse are one program.
 _PEAKS = ("max_rotation", "max_velocity", "impact_count", "overturned", "margin", "status")
 _STATES = ("state", "max_rotation", "impact_count", "margin", "status")
 
 
 def _over(value: Array, size: Array) -> Array:
-    """A quotient that may be infinite; without slopes there, where they would be no numbers."""
+    """Divide by a size where the value is finite; an infinite value stays, with zero slopes in place of NaN."""
     finite = jnp.isfinite(value)
     return jnp.where(finite, jnp.where(finite, value, 0.0) / size, value)
 
 
 def _kept(result: Outcome, block: Block) -> dict:
-    """Of a spectrum, and of a map."""
+    """Return the results that a spectrum or a map keeps of an outcome."""
     rest = {name: getattr(result, name) for name in ("impact_count", "overturned", "margin", "status")}
     velocity = _over(result.max_velocity, block.p * block.alpha)
     state = jnp.where(result.overturned, jnp.where(result.impact_count > 0, 2, 1), 0)
@@ -347,8 +349,8 @@ def _kept(result: Outcome, block: Block) -> dict:
     return {"state": state, "max_rotation": _over(result.max_rotation, block.alpha), "max_velocity": velocity, **rest}
 
 
-# The functions of surfaces. What is given for all points lies in the scene, a pytree, so that a second surface of a
-# kind is not compiled again.
+# Functions of surfaces. Arguments shared by all points lie in the scene, a pytree, so a second surface of a kind is not
+# compiled again.
 
 
 @light
@@ -360,7 +362,7 @@ def _under_motion(period, scene):
 
 
 def under_pulse(*point_and_scene) -> tuple[Outcome, Block]:
-    """The outcome at one point, and the block: `(*parameters, intensity, ratio, scene)`."""
+    """Return the outcome at one point, and the block: `(*parameters, intensity, ratio, scene)`."""
     *point, (alpha, restitution, pulse, model, engine) = point_and_scene
     alpha, *parameters, intensity, ratio = _in_one_precision(alpha, *point)
     block = Block(alpha, jnp.ones_like(alpha), restitution)
@@ -369,8 +371,10 @@ def under_pulse(*point_and_scene) -> tuple[Outcome, Block]:
 
 
 def _in_one_precision(*numbers: Array, of: Any = ()) -> list[Array]:
-    """The numbers as precise as the most precise of them, and of what a tree holds: else what is made of one alone has
-    its digits, and no more."""
+    """Convert the numbers to the highest precision of them and of a tree's leaves.
+
+    Otherwise a quantity made of one number alone has only that number's digits.
+    """
     kind = jnp.result_type(*numbers, *jax.tree.leaves(of))
     return [x.astype(kind) for x in numbers]
 

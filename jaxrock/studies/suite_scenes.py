@@ -1,7 +1,7 @@
-"""The scenes of a suite: every motion at many scales, both ways round, on many blocks.
+"""Scenes of a suite: every motion at many scales, with both signs, on many blocks.
 
-Motions go one after the other, the scenes of one all at once: they share its samples. Records get room for as many
-samples as the next power of two, so that a few programs serve a suite of any lengths.
+Motions run one after the other; the scenes of one motion run together and share its samples. Records are padded to the
+next power of two, so that a few programs serve a suite of any lengths.
 """
 
 from collections.abc import Callable
@@ -32,7 +32,7 @@ FACINGS = {"one": (1,), "both": (1, -1)}  # signs of the horizontal motion
 
 
 class Scenes(NamedTuple):
-    """What became of them: arrays (motions, factors, blocks).
+    """Results of the scenes: arrays (motions, factors, blocks).
 
     - `verdict`: 1 toppled, 0 stood, -1 undecided.
     - `rotation`: peak rotation over slenderness (of an asymmetric block over the smaller one); infinite if it toppled,
@@ -46,7 +46,7 @@ class Scenes(NamedTuple):
 
 
 def stacked(block: Block | AsymmetricBlock) -> Block | AsymmetricBlock:
-    """A block with parameters of shape (draws,); what all draws share stays."""
+    """Broadcast the parameters of a block to shape (draws,); leaves that all draws share stay."""
     shape = np.broadcast_shapes((1,), *(np.shape(leaf.value) for leaf in leaves_of(block) if not leaf.is_shared))
     if len(shape) > 1:
         raise ValueError(f"The parameters of `block` must be numbers or lists, but have shape {shape}.")
@@ -54,30 +54,30 @@ def stacked(block: Block | AsymmetricBlock) -> Block | AsymmetricBlock:
 
 
 def _of_each(blocks: Block | AsymmetricBlock, function: Callable[[np.ndarray], np.ndarray]):
-    """Blocks with another array of every number of a block; what all share stays."""
+    """Apply a function to the array of every number of a block; leaves that all draws share stay."""
     arrays = jax.tree.map(np.asarray, blocks)
     return jax.tree.map(lambda x, own: placed(x if own else function(x)), arrays, shared(blocks))
 
 
 def is_symmetric(block: Block | AsymmetricBlock) -> bool:
-    """Whether a block that is turned round is its own mirror image."""
+    """Return whether a block is its own mirror image, so that turning it round changes nothing."""
     return isinstance(block, Block) and not tells_sides(block.law, block.corners)
 
 
 def both_ways(factors: np.ndarray, facing: str) -> np.ndarray:
-    """Factors (motions, levels) as they are, and with the other sign after them, where blocks are turned round."""
+    """Append factors of the opposite sign to factors (motions, levels) if `facing` turns blocks round."""
     return np.concatenate([way * factors for way in FACINGS[facing]], axis=1)
 
 
 def as_draws(verdict: np.ndarray, facing: str) -> np.ndarray:
-    """Verdicts (motions, levels, draws) under factors of `both_ways`: blocks that are turned round are more draws."""
+    """Reshape verdicts (motions, levels, draws) under factors of `both_ways`: turned blocks become further draws."""
     motions, rows, draws = verdict.shape
     ways = len(FACINGS[facing])
     return verdict.reshape(motions, ways, -1, draws).swapaxes(1, 2).reshape(motions, rows // ways, ways * draws)
 
 
 def rising_scales(scale: Values) -> np.ndarray:
-    """Factors on all motions as an array, of one number, too."""
+    """Return factors on all motions as an array, also for a single number."""
     scales = np.atleast_1d(np.asarray(size("scale", scale), float))
     if scales.ndim > 1 or scales.size == 0 or np.any(np.diff(scales) <= 0):
         raise ValueError(f"Argument `scale` must be a number, or rise from scale to scale, but is {shown(scale)}.")
@@ -85,7 +85,7 @@ def rising_scales(scale: Values) -> np.ndarray:
 
 
 def capacities(verdict: np.ndarray, levels: ArrayLike) -> np.ndarray:
-    """Between which levels a block first topples, (..., 2); the second axis of the verdicts is that of the levels."""
+    """Find the levels between which a block first topples, (..., 2); the second axis of the verdicts is the levels."""
     ends, count = np.concatenate([[0.0], np.asarray(levels), [np.inf]]), verdict.shape[1]
     toppled, stood = verdict == TOPPLED, verdict == STOOD
     first = np.where(toppled.any(axis=1), toppled.argmax(axis=1), count)
@@ -94,17 +94,17 @@ def capacities(verdict: np.ndarray, levels: ArrayLike) -> np.ndarray:
 
 
 def comes_back(verdict: np.ndarray) -> np.ndarray:
-    """Whether it stands at a level above one that topples it, of the same verdicts."""
+    """Return whether a block stands at a level above one that topples it."""
     return np.any(np.maximum.accumulate(verdict == TOPPLED, axis=1) & (verdict == STOOD), axis=1)
 
 
 def scenes(
     blocks: Block | AsymmetricBlock, suite: Suite, factors: np.ndarray, model: AbstractEquation, engine, progress
 ) -> Scenes:
-    """Stacked blocks under every motion of a suite times its factors, (motions, factors) or (factors,) for all."""
+    """Compute stacked blocks under every motion of a suite times factors: (motions, factors) or (factors,) for all."""
     factors = np.broadcast_to(factors, (len(suite), np.shape(factors)[-1]))
     draws, count = jax.tree.leaves(blocks)[0].shape[0], factors.shape[1]
-    # Neighbours differ by the factor: they move alike.
+    # Neighbours differ by the factor, so they move alike.
     lanes = _of_each(blocks, lambda x: np.repeat(x, count))
     model = current_model(model, lanes, next(suite.motions()), factors)
     bar = Progress(factors.size * draws, "suite", progress)
@@ -119,7 +119,7 @@ def scenes(
 
 @quickly(follows_scenes=True)
 def of_motion(motion, blocks, factors, model, engine) -> Scenes:
-    """All scenes of one motion, side by side: stacked blocks, each with its factor."""
+    """Compute all scenes of one motion, side by side: stacked blocks, each with its factor."""
 
     def one(lane, factor):
         block = one_of_many(blocks, lane)

@@ -1,4 +1,4 @@
-"""What is varied in a search for critical values: z is the logarithm of a factor, on the motion or on its times."""
+"""Search axes for critical values: z is the logarithm of a factor, on the motion or on its times."""
 
 import abc
 import operator
@@ -29,31 +29,31 @@ class AbstractVaried(eqx.Module):
 
     @abc.abstractmethod
     def scene(self, z, block, motion):
-        """What is asked for at a factor."""
+        """Return the scene at a factor e^z."""
 
     @abc.abstractmethod
     def unit(self, block, motion):
-        """What the factor multiplies."""
+        """Return the quantity that the factor multiplies."""
 
     @abc.abstractmethod
     def units(self, both, amplitude):
-        """What the factors multiply in many scenes, block and motion of arrays, of known amplitudes."""
+        """Return `unit` for many scenes, from block and motion of arrays and known amplitudes."""
 
     @abc.abstractmethod
     def amplitude(self, value, own):
-        """Of the motion at a critical value, where its own is given [g]."""
+        """Return the amplitude of the motion at a critical value; `own`: the amplitude of the motion as it is [g]."""
 
     @abc.abstractmethod
     def keeps(self, name: str) -> bool:
-        """Whether the critical value depends on a parameter."""
+        """Return whether the critical value depends on a parameter."""
 
     def margin(self, z, block, motion):
-        """Margin and outcome of the scene with the factor e^z."""
+        """Return margin and outcome of the scene with the factor e^z."""
         result = outcome(*self.scene(z, block, motion), self.model, engine=self.engine)
         return result.margin, result
 
     def at(self, z, block, motion):
-        """Margin (not a number where it is not known), its slope, and impacts."""
+        """Return the margin (NaN where it is unknown), its slope, and the number of impacts."""
         margin, slope, result = jax.jvp(
             lambda z: self.margin(z, block, motion), (z,), (jnp.ones_like(z),), has_aux=True
         )
@@ -61,7 +61,7 @@ class AbstractVaried(eqx.Module):
         return jnp.where(decided, margin, jnp.nan), slope, result.impact_count
 
     def slopes(self, z, block, motion):
-        """Derivatives of the logarithm of the critical value by the parameters."""
+        """Return derivatives of the logarithm of the critical value by the parameters."""
         known = named(block, motion)
         values = {name: jnp.asarray(value) for name, value in known.items() if self.keeps(name)}
 
@@ -81,68 +81,70 @@ class AbstractVaried(eqx.Module):
 
 
 class Amplitude(AbstractVaried):
-    """A larger motion."""
+    """Search over the amplitude of the motion."""
 
     def scene(self, z, block, motion):
         """Return the scene at a factor; a NaN factor marks an unknown scene, whose outcome is NaN too."""
         return block, scaled(motion, jnp.exp(z))
 
     def unit(self, block, motion):
-        """What the factor multiplies: the amplitude [g]."""
+        """Return the amplitude of the motion [g], which the factor multiplies."""
         return jnp.abs(named(block, motion)["amplitude"])
 
     def units(self, both, amplitude):
-        """What the factors multiply in many scenes: their amplitudes [g]."""
+        """Return the amplitudes of many scenes [g]."""
         return amplitude
 
     def amplitude(self, value, own):
-        """Of the motion at a critical value, where its own is given [g]."""
+        """Return the critical value itself, which is an amplitude [g]."""
         return value
 
     def keeps(self, name: str) -> bool:
-        """Whether the critical value depends on a parameter."""
+        """Return whether the critical value depends on a parameter."""
         return name != "amplitude"
 
 
 class Duration(AbstractVaried):
-    """A longer motion, which is a larger p: only their product counts."""
+    """Search over the duration of the motion, by way of p: only the product of p and time counts."""
 
     def scene(self, z, block, motion):
-        """What is asked for at a factor."""
+        """Return the scene at a factor e^z, with p larger by that factor in place of a longer motion."""
         return faster(block, jnp.exp(z)), motion
 
     def unit(self, block, motion):
-        """What the factor multiplies: the duration of the motion [s]."""
+        """Return the duration of the motion [s], which the factor multiplies."""
         return motion.end
 
     def units(self, both, amplitude):
-        """What the factors multiply in many scenes: the durations of their motions [s]."""
+        """Return the durations of the motions of many scenes [s]."""
         return _ends(both, amplitude.size)
 
     def amplitude(self, value, own):
-        """Of the motion at a critical value, where its own is given [g]."""
+        """Return the amplitude of the motion as it is [g]."""
         return own
 
     def keeps(self, name: str) -> bool:
-        """Whether the critical value depends on a parameter."""
+        """Return whether the critical value depends on a parameter."""
         return name not in ("duration", "period", "dt")
 
 
 @quickly(eqx.filter_jit)
 def _ends(both, size: int):
-    """Of the motions of so many scenes."""
+    """Return the ends of the motions of `size` scenes."""
     return jax.vmap(lambda index: one_of_many(both, index)[1].end)(jnp.arange(size))
 
 
 def faster(block: Block | AsymmetricBlock, factor) -> Block | AsymmetricBlock:
-    """A smaller block of the same shape: its frequency parameters times a factor."""
+    """Return a smaller block of the same shape: its frequency parameters times a factor."""
     name = "p" if isinstance(block, Block) else "p1"
     return eqx.tree_at(operator.attrgetter(name), block, getattr(block, name) * factor)
 
 
 def check_sizeless(block: Block | AsymmetricBlock, model: AbstractEquation) -> None:
-    """Raise ValueError where the law of restitution, or a model of the user's own, is known to depend on the size of a
-    block by itself, and not only through p times the time."""
+    """Raise ValueError where the restitution or a user's model depends on block size other than through p times time.
+
+    Traced arguments are only checked for a dependence on the speed of impacts.
+    """
     if block.law.depends_on_speed:  # a longer motion is taken as a larger p, which makes impacts faster
         raise ValueError("Argument `block` must have a restitution that does not depend on the speed of impacts.")
     if is_traced((block, model)):
@@ -162,7 +164,7 @@ def check_sizeless(block: Block | AsymmetricBlock, model: AbstractEquation) -> N
 
 @quickly()
 def _accelerations(model: AbstractEquation, block: Block | AsymmetricBlock):
-    """Some accelerations of each side, over its p squared."""
+    """Sample accelerations of each side, over its p squared."""
     found = []
     for side in (block,) if isinstance(block, Block) else block.sides:
         moments = model.moments(side)
@@ -174,10 +176,10 @@ def _accelerations(model: AbstractEquation, block: Block | AsymmetricBlock):
 
 @eqx.filter_custom_jvp
 def on_border(z, found, balanced, scene):
-    """Ends `z`, which were found without derivatives, with those of the implicit function: the margin stays zero.
+    """Attach the derivatives of the implicit function (the margin stays zero) to ends `z` found without derivatives.
 
-    `scene`: what is varied, block and motion. Where the block does not come to balance derivatives are not numbers;
-    where no end was found they are zero.
+    `scene`: the search axis, block and motion. Derivatives are NaN where the block does not come to balance, and zero
+    where no end was found.
     """
     return z
 
@@ -193,7 +195,7 @@ def _on_border_jvp(primals, tangents):
         kind, *both = eqx.combine(moving, scene)
         return jax.vmap(lambda z: kind.margin(z, *both)[0])(z)
 
-    # By both in one program.
+    # One linearization gives the derivatives by both.
     _, push = jax.linearize(margins, z, moving)
     change = push(jnp.zeros_like(z), tangents[3])
     slope = push(jnp.ones_like(z), jax.tree.map(jnp.zeros_like, tangents[3]))
