@@ -41,7 +41,8 @@ def stripes(seed, motions, between, within, draws):
 
 
 def held(fit, intervals, dispersion):
-    """Whether the truth lies in the intervals (median, dispersion); and by standard errors, NaN without a fit."""
+    """Return whether the truth lies in the intervals (median, dispersion); and by standard errors, NaN without a
+    fit."""
     ends = np.array([intervals.median, intervals.dispersion])
     truth = np.array([MEDIAN, dispersion])
     inside = (ends[:, 0] <= truth) & (truth <= ends[:, 1])

@@ -122,7 +122,8 @@ def _of_kinds(kinds: tuple[type, ...], allowed: str, name: str, value: Any) -> A
 
 
 def _is_own(hint: Any) -> bool:
-    """Whether it is a class of the package, or of a library, and not one of Python, NumPy or shapes of arrays."""
+    """Return whether it is a class of the package, or of a library, and not one of Python, NumPy or shapes of
+    arrays."""
     return isinstance(hint, type) and hint.__module__.split(".")[0] in ("jaxrock", "diffrax")
 
 

@@ -26,12 +26,12 @@ def as_meant(number: ArrayLike) -> float:
 
 
 def is_traced(tree: Any) -> bool:
-    """Whether any array in it is traced: within `jax.jit`, `jax.vmap` or a derivative."""
+    """Return whether any array in it is traced: within `jax.jit`, `jax.vmap` or a derivative."""
     return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(tree))
 
 
 def is_at_hand(tree: Any) -> bool:
-    """Whether NumPy may compute with the arrays in it: they are known, and where nobody has put them."""
+    """Return whether NumPy may compute with the arrays in it: they are known, and where nobody has put them."""
     leaves = jax.tree.leaves(tree)
     return not is_traced(leaves) and not any(getattr(leaf, "committed", False) for leaf in leaves)
 
@@ -144,7 +144,7 @@ def _no_number(name: str, value: Any) -> ValueError:
 
 
 def _holds_no_number(value: Any) -> bool:
-    """Whether it holds what NumPy or JAX would take for a number: True, None."""
+    """Return whether it holds what NumPy or JAX would take for a number: True, None."""
     if isinstance(value, (list, tuple)):
         return any(map(_holds_no_number, value))
     return value is None or isinstance(value, (bool, np.bool_, str, bytes))
@@ -205,8 +205,8 @@ def _as_given(value: Values, known: np.ndarray, bad: np.ndarray) -> str:
 
 
 def _failed(holds: Callable) -> Callable:
-    """Whether it does not hold somewhere. Under `jax.vmap` outside of `jax.jit` every operation is compiled by itself:
-    what is there once and for all is one operation."""
+    """Return whether it does not hold somewhere. Under `jax.vmap` outside of `jax.jit` every operation is compiled by
+    itself: what is there once and for all is one operation."""
     is_constant = getattr(holds, "__closure__", None) is None and "<locals>" not in holds.__qualname__
     return _compiled_failed(holds) if is_constant else lambda array: ~jnp.all(holds(array))
 
@@ -264,7 +264,7 @@ def throwing(wanted: bool) -> Iterator[None]:
 
 
 def throws() -> bool:
-    """Whether numbers outside of their ranges raise now."""
+    """Return whether numbers outside of their ranges raise now."""
     return _throws.get()
 
 

@@ -87,7 +87,8 @@ class Frame(ctypes.Structure):
 
 
 def is_known() -> bool:
-    """Whether XLA's interface is the one that is written down here, by the header of the jaxlib that is installed."""
+    """Return whether XLA's interface is the one that is written down here, by the header of the jaxlib that is
+    installed."""
     header = Path(jaxlib.__file__).parent / "include" / "xla" / "ffi" / "api" / "c_api.h"
     if not header.exists():
         return True  # nothing says otherwise, and XLA asks for the version itself
@@ -130,7 +131,7 @@ def _first(table: int, kind: Any) -> Any:
 
 
 def has_check() -> bool:
-    """Whether XLA's CPU backend knows `CHECK`, from now on."""
+    """Return whether XLA's CPU backend knows `CHECK`, from now on."""
     with _one_at_a_time:
         return _registered() is not None
 

@@ -95,7 +95,7 @@ def set_parameters(owner: eqx.Module, **values: Any) -> None:
 
 
 def is_ours(owner: Any) -> bool:
-    """Whether an object's class is one of the package, and not of the user's own."""
+    """Return whether an object's class is one of the package, and not of the user's own."""
     return type(owner).__module__.partition(".")[0] == __name__.partition(".")[0]
 
 
@@ -141,12 +141,12 @@ class Leaf(NamedTuple):
 
     @property
     def is_shared(self) -> bool:
-        """Whether it belongs to the whole, and not to one scene of many."""
+        """Return whether it belongs to the whole, and not to one scene of many."""
         return self.declared.axes != 0
 
     @property
     def is_number(self) -> bool:
-        """Whether it is one number for a scene, by which derivatives may be taken."""
+        """Return whether it is one number for a scene, by which derivatives may be taken."""
         one = self.declared.axes == 0 or (self.declared.axes is None and jnp.ndim(self.value) == 0)
         free = self.declared.is_free and not self.declared.is_whole
         return one and free and jnp.issubdtype(jnp.result_type(self.value), jnp.inexact)

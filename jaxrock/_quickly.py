@@ -60,7 +60,7 @@ def quickly(jit: Callable = jax.jit, follows_scenes: bool = False, **settings: A
 
 
 def _are_few(tree: Any) -> bool:
-    """Whether all arrays in it are known, small, and on a CPU."""
+    """Return whether all arrays in it are known, small, and on a CPU."""
     arrays = [x for x in jax.tree.leaves(tree) if isinstance(x, (jax.Array, np.ndarray))]
     if is_traced(tree) or sum(x.size for x in arrays) > MUCH:
         return False

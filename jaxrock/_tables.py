@@ -77,7 +77,7 @@ def over_time(time, histories: dict[str, tuple[Any, str]]) -> dict[str, Column]:
 
 
 def is_status(values: Any) -> bool:
-    """Whether it is a status, or an array of them."""
+    """Return whether it is a status, or an array of them."""
     return hasattr(values, "_enumeration")
 
 

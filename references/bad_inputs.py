@@ -885,7 +885,7 @@ def _of_result(call: Call, result: Any) -> str | None:
 
 
 def _lost(result: Any) -> bool:
-    """Whether it overturned: then peaks are infinite."""
+    """Return whether it overturned: then peaks are infinite."""
     return bool(np.any(getattr(result, "overturned", False)))
 
 

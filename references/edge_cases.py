@@ -37,7 +37,7 @@ class Group:
 
     @property
     def delayed(self):
-        """Whether the motion waits first."""
+        """Return whether the motion waits first."""
         return self.tuned == "delay"
 
     @property

@@ -282,7 +282,7 @@ def land(block, path):
 
 
 def lost(block, path, motion):
-    """Whether no acceleration still to come can bring a block of the linear model back."""
+    """Return whether no acceleration still to come can bring a block of the linear model back."""
     growth = path.x - block.alpha + path.v / block.p
     return block.linear and path.side != 0 and growth > motion.bound(path.piece)
 

@@ -41,7 +41,7 @@ def _outcomes(alpha, amplitude, period):
 
 
 def outcomes(*scenes):
-    """Whether blocks overturn, and their peak rotation over their slenderness: any number, by one program."""
+    """Return whether blocks overturn, and their peak rotation over their slenderness: any number, by one program."""
     arrays = np.broadcast_arrays(*scenes)
     count = arrays[0].size
     lists = [np.resize(x, (-(-count // 64), 64)) for x in arrays]

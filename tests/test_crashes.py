@@ -328,7 +328,7 @@ def test_a_store_that_cannot_be_made_leaves_nothing(tmp_path, small_disk):
 
 
 def interrupted(function, after):
-    """Whether Ctrl-C came before the function was done, so many seconds after it began."""
+    """Return whether Ctrl-C came before the function was done, so many seconds after it began."""
 
     def strike(*_):
         raise KeyboardInterrupt

@@ -196,7 +196,8 @@ def test_a_film_follows_the_response(response):
 
 
 def knots_drawn(axis):
-    """Whether the end of `PULSE`, and the moment before it, are among the times of a curve, whose steps miss them."""
+    """Return whether the end of `PULSE`, and the moment before it, are among the times of a curve, whose steps miss
+    them."""
     time = axis.lines[0].get_xdata()
     return np.isin([np.nextafter(1.0, 0.0), 1.0], time).all() and np.all(np.diff(time) >= 0)
 

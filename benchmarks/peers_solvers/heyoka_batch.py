@@ -69,7 +69,7 @@ class Batch:
         return pars[4, lanes] * (1 - np.exp(pars[5, lanes] * (time - pars[6, lanes])))
 
     def driven(self, time, lane):
-        """Whether the ground acceleration exceeds the threshold."""
+        """Return whether the ground acceleration exceeds the threshold."""
         alpha = self.integrator.pars[1, lane]
         return abs(self.force(time, lane)) > (alpha if self.linear else math.tan(alpha))
 

@@ -189,7 +189,7 @@ class FlexibleBlock(Owner):
 
     @property
     def is_linear(self) -> bool:
-        """Whether every phase of its motion is linear."""
+        """Return whether every phase of its motion is linear."""
         return self.base != "sine" and self.rotations == "small" and not self.p_delta
 
     @property
@@ -230,7 +230,8 @@ def _bears_itself(block: FlexibleBlock) -> Bool[Array, "..."]:
 
 
 def is_possible(block: FlexibleBlock) -> Bool[Array, ""]:
-    """Whether the constructor takes such numbers: a step of an optimiser may have changed those of a block as it is."""
+    """Return whether the constructor takes such numbers: a step of an optimiser may have changed those of a block as it
+    is."""
     known = [leaf for leaf in leaves_of(block) if leaf.declared.axes is not None]
     held = [leaf.declared.range.holds(leaf.value) for leaf in known]
     held += [fits(block.law, block.width, block.height), *(holds(block) for _, holds in _DEMANDS)]

@@ -93,7 +93,7 @@ class AbstractRestitution(Owner):
 
     @property
     def depends_on_speed(self) -> bool:
-        """Whether the ratio depends on the speed of the impact; if not, it is computed once for a scene."""
+        """Return whether the ratio depends on the speed of the impact; if not, it is computed once for a scene."""
         return True
 
     @property
@@ -259,7 +259,7 @@ def on_sides(law: AbstractRestitution, corners: Corners) -> tuple[Corners, Corne
 
 
 def tells_sides(law: AbstractRestitution, corners: Corners) -> bool:
-    """Whether the ratio depends on the side: whether its programs on either side are two."""
+    """Return whether the ratio depends on the side: whether its programs on either side are two."""
     if type(law) in _ALIKE:
         return False
     arrays, others = eqx.partition((law, corners), eqx.is_array)
@@ -324,7 +324,7 @@ def fitting_width(law: AbstractRestitution, width: Real, height: Real) -> Real:
 
 
 def fits(law: AbstractRestitution, width: ArrayLike, height: Real) -> ArrayLike:
-    """Whether the law has a value for rectangles so wide."""
+    """Return whether the law has a value for rectangles so wide."""
     if not isinstance(law, Housner):
         return True
     width, height, loss = map(if_traced, (width, height, law._loss))
@@ -359,7 +359,7 @@ class Reset(eqx.Module):
 
     @property
     def depends_on_speed(self) -> bool:
-        """Whether the ratio does."""
+        """Return whether the ratio does."""
         return self.law.depends_on_speed
 
     def ratio(self, speed: Real) -> Real:

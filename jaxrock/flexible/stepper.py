@@ -92,7 +92,7 @@ def resets_of(block: FlexibleBlock) -> tuple[Reset, ...]:
 
 
 def _may_be(block: FlexibleBlock, ground: AbstractMotion) -> Bool[Array, ""]:
-    """Whether no step of an optimiser has made of block or motion what a constructor refuses."""
+    """Return whether no step of an optimiser has made of block or motion what a constructor refuses."""
     knots = ground.knots
     forward = (knots[0] >= 0) & (knots[-1] >= 0) & (ground.lengths >= 0).all()
     return is_possible(block) & forward
@@ -302,7 +302,7 @@ class FlexibleScene(eqx.Module):
         return self.rocking.project @ (state.motion - state.side * self.numbers.center)
 
     def _never_returns(self, state: FlexibleState) -> Bool[Array, ""]:
-        """Whether, without further shaking, the unstable mode outgrows all others from here on."""
+        """Return whether, without further shaking, the unstable mode outgrows all others from here on."""
         side, rates = state.side, self.rocking.rates.real
         amplitudes = self._amplitudes(state)
         growing = rates == jnp.max(rates)

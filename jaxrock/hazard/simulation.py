@@ -188,7 +188,7 @@ class SimulatedFragility(AbstractTable):
 
     @property
     def monotone(self) -> Bool[np.ndarray, "motions draws"]:
-        """Whether every level above the first that topples a block topples it, too (undecided ones may have)."""
+        """Return whether every level above the first that topples a block topples it, too (undecided ones may have)."""
         return ~comes_back(self.verdict)
 
     @property
@@ -250,7 +250,8 @@ def simulated_fragility(
     engine: AbstractEngine | None = None,
     progress: bool | None = None,
 ) -> SimulatedFragility:
-    """Whether blocks topple under motions that are scaled to levels of intensity (stripes, or incremental analysis).
+    """Simulate whether blocks topple under motions that are scaled to levels of intensity (stripes, or incremental
+    analysis).
 
     **Arguments:**
 

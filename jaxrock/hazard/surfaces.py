@@ -315,7 +315,7 @@ def simulated_surface(
     engine: AbstractEngine | None = None,
     progress: bool | None = None,
 ) -> SimulatedSurface:
-    """Whether blocks topple under pulses, over peak acceleration and PGV/PGA.
+    """Simulate whether blocks topple under pulses, over peak acceleration and PGV/PGA.
 
     **Arguments:**
 

@@ -108,7 +108,7 @@ class Search(NamedTuple):
     allowed: Callable[[np.ndarray], np.ndarray]
 
     def reached(self, changes: np.ndarray) -> np.ndarray:
-        """Whether changes, (lanes, n), do what is wanted."""
+        """Return whether changes, (lanes, n), do what is wanted."""
         margin, known = self.site.margins(changes)
         side, target = np.asarray(self.site.side), np.asarray(self.site.target)
         return ((side * (margin - target) <= 0) & known).all(axis=1)

@@ -43,7 +43,7 @@ _END = 0.02  # of a range, where samples are counted: an end is open if there ar
 
 
 class PosteriorStatus(Enumeration):
-    """Whether samples can be trusted; `PosteriorStatus[posterior.status]` is the message."""
+    """Result code that says if samples can be trusted; `PosteriorStatus[posterior.status]` is the message."""
 
     successful = item("The chains agree, and hold enough independent samples.")
     open_interval = item(
@@ -202,7 +202,7 @@ class _Wanted(NamedTuple):
     seed: int
 
     def is_reached(self, sizes: np.ndarray, r_hat: np.ndarray) -> bool:
-        """Whether chains agree, and hold enough independent samples."""
+        """Return whether chains agree, and hold enough independent samples."""
         return bool(sizes.min() >= self.size and r_hat.max() < _ALIKE)
 
 
@@ -281,7 +281,7 @@ def _summits(problem: Problem, estimate: Estimate) -> np.ndarray:
 
 
 def _within(places: np.ndarray, low: np.ndarray, high: np.ndarray, dtype) -> bool:
-    """Whether places are in their ranges, but for the rounding of numbers of this type."""
+    """Return whether places are in their ranges, but for the rounding of numbers of this type."""
     rounding = np.finfo(dtype).eps * np.maximum(1.0, np.maximum(np.abs(low), np.abs(high)))
     slack = np.maximum(1e-9 * (high - low), 4 * rounding)
     return bool(((places > low - slack) & (places < high + slack)).all())

@@ -1,4 +1,4 @@
-"""Whether the package is in this process still what it was: a test may patch it, a notebook load a module anew.
+"""Detect changes of the package within this process: a test may patch it, a notebook load a module anew.
 
 What is kept on disk is found by names and by the digest of the package's files, which tell nothing of that.
 """
@@ -37,7 +37,8 @@ class _Space(NamedTuple):
         return cls(of, names, before, len(names), list(found), functions, list(map(_CODE, functions)))
 
     def stays(self) -> bool:
-        """Whether nothing differs now. It is asked of ten thousand names where a scene is traced, so by `map` alone."""
+        """Return whether nothing differs now. It is asked of ten thousand names where a scene is traced, so by `map`
+        alone."""
         return (
             len(self.names) == self.many
             and all(map(is_, map(self.names.get, self.before, repeat(self)), self.before.values()))
@@ -60,7 +61,7 @@ _found: set[str] = set()
 
 
 def any_seen() -> bool:
-    """Whether `changes` has ever found any."""
+    """Return whether `changes` has ever found any."""
     return bool(_found)
 
 

@@ -55,7 +55,7 @@ def facts(tree: Any) -> str | None:
 
 
 def still_hold(told: str) -> bool:
-    """Whether the package is as it was when these facts were told."""
+    """Return whether the package is as it was when these facts were told."""
     found = changes.changes()
     return f"{_CHANGED}{found}" in told if found else _CHANGED not in told
 

@@ -91,7 +91,7 @@ class Terms(eqx.Module):
 
     @property
     def trigonometric(self) -> bool:
-        """Whether sin x or cos x appear at all."""
+        """Return whether sin x or cos x appear at all."""
         return self.sine is not None or self.cosine is not None
 
     def summed(self, basis: Basis, empty: Any = 0.0) -> Any:
@@ -168,7 +168,7 @@ class Coefficients(AbstractMoments):
 
     @property
     def trigonometric(self) -> bool:
-        """Whether sin x or cos x appear at all."""
+        """Return whether sin x or cos x appear at all."""
         return self.restoring_terms.trigonometric or self.arm_terms.trigonometric
 
     def restoring(self, angle: Angle) -> Scalar:
@@ -200,7 +200,7 @@ class Coefficients(AbstractMoments):
 
     @property
     def sinusoidal(self) -> bool:
-        """Whether the restoring moment is a sinusoid, perhaps with a constant (else it is one straight line)."""
+        """Return whether the restoring moment is a sinusoid, perhaps with a constant (else it is one straight line)."""
         return self.restoring_terms.sine is not None
 
     @property
@@ -246,14 +246,14 @@ class Coefficients(AbstractMoments):
 
     @property
     def _arm_may_turn(self) -> bool:
-        """Whether the arm may change its sign or grow before pi/2, by its form."""
+        """Return whether the arm may change its sign or grow before pi/2, by its form."""
         arm = self.arm_terms
         several = arm.constant is not None and arm.cosine is not None
         return not self.arm_lasts and (arm.line is not None or arm.sine is not None or several)
 
     @property
     def _may_right_again(self) -> bool:
-        """Whether the restoring moment may rise again before pi/2, by its form."""
+        """Return whether the restoring moment may rise again before pi/2, by its form."""
         return self.restoring_terms.constant is not None and self.restoring_terms.cosine is not None
 
     def held(self, angle: Angle, velocity: Scalar, push: Scalar, weight: Scalar | None = None) -> Scalar:

@@ -171,17 +171,17 @@ class AbstractEquation(Owner):
 
     @property
     def falls_flat(self) -> bool:
-        """Whether a rotation of pi/2 means that the block lies on its side."""
+        """Return whether a rotation of pi/2 means that the block lies on its side."""
         return True
 
     @property
     def is_series(self) -> bool:
-        """Whether its moments are `Coefficients`, so that the series engine can solve it."""
+        """Return whether its moments are `Coefficients`, so that the series engine can solve it."""
         return True
 
     @property
     def feels_weight(self) -> bool:
-        """Whether a vertical acceleration changes the restoring moment; if not, vertical motions are refused."""
+        """Return whether a vertical acceleration changes the restoring moment; if not, vertical motions are refused."""
         return True
 
 

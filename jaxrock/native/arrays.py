@@ -157,7 +157,7 @@ def _place_of(name: str) -> Callable:
 
 
 def is_one_place(equation) -> bool:
-    """Whether a look-up, or what is set, is at one place; products of a batch are at many."""
+    """Return whether a look-up, or what is set, is at one place; products of a batch are at many."""
     name, parameters = equation.primitive.name, equation.params
     if name == "dot_general":
         return not any(parameters["dimension_numbers"][1])

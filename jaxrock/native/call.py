@@ -127,7 +127,7 @@ class Plan:
 
     @property
     def has_own_lists(self) -> bool:
-        """Whether a lane has long lists of its own, or what XLA computes for it."""
+        """Return whether a lane has long lists of its own, or what XLA computes for it."""
         return bool(self._each.outputs) or any(is_long(x.shape) for x in self.own)
 
     def __call__(self, leaves: list, threads: int, count=None) -> list:
@@ -202,7 +202,7 @@ _DEAR = {
 
 
 def _is_before_loops(equation) -> bool:
-    """Whether what stays the same in a loop is computed before it, once for each scene."""
+    """Return whether what stays the same in a loop is computed before it, once for each scene."""
     return equation.primitive.name in _DEAR or not is_known(equation) or any(map(_is_large, equation.outvars))
 
 

@@ -106,7 +106,7 @@ class Emitter:
         return total
 
     def any(self, mask):
-        """Whether any lane is set."""
+        """Return whether any lane is set."""
         bits = ir.IntType(self.lanes)
         return self.b.icmp_unsigned("!=", self.b.bitcast(mask, bits), bits(0))
 
@@ -329,7 +329,7 @@ _LISTS = [(n,) for n in range(SMALL + 1)]
 
 
 def is_known(equation) -> bool:
-    """Whether an operation may be written; in the end only writing it tells."""
+    """Return whether an operation may be written; in the end only writing it tells."""
     if equation.primitive.name not in WITH_PROGRAMS:
         name = equation.primitive.name
         if name == "sort":

@@ -61,7 +61,7 @@ class _Around:
 
 
 def _has_any(jaxpr, constant: set, is_left: Callable, inside: bool = False) -> bool:
-    """Whether there is anything to hoist: of what is within a program, or of all, if it is `inside` another."""
+    """Return whether there is anything to hoist: of what is within a program, or of all, if it is `inside` another."""
     same, constant = _same(jaxpr, constant)
     if inside and any(map(is_left, same)):
         return True

@@ -26,7 +26,8 @@ def kind_of(variable: Any) -> np.dtype:
 
 
 def is_long(shape: tuple[int, ...]) -> bool:
-    """Whether an array stays in memory, where single numbers of it are looked up: a long list, or a few of them."""
+    """Return whether an array stays in memory, where single numbers of it are looked up: a long list, or a few of
+    them."""
     if len(shape) == 2 and shape[0] <= SMALL and math.prod(shape) > SMALL**2:
         return True
     if len(shape) > 1 and math.prod(shape) > SMALL**2:

@@ -118,7 +118,7 @@ def _look_up(e, memory: Memory, index):
 
 
 def _is_column(parameters: dict, memory: Memory) -> bool:
-    """Whether a gather takes one number of each of some lists: what `jax.vmap` makes of a look-up."""
+    """Return whether a gather takes one number of each of some lists: what `jax.vmap` makes of a look-up."""
     told = parameters["dimension_numbers"]
     maps = tuple(told.offset_dims), tuple(told.collapsed_slice_dims), tuple(told.start_index_map)
     inside = parameters["mode"] == jax.lax.GatherScatterMode.CLIP

@@ -138,7 +138,7 @@ def _take_apart(module: Module) -> None:
 
 
 def is_there(name: str) -> bool:
-    """Whether XLA finds machine code under a name; what is kept from another session it does, too."""
+    """Return whether XLA finds machine code under a name; what is kept from another session it does, too."""
     with _one_at_a_time:
         if name in _registered:
             return True

@@ -36,7 +36,7 @@ class Unsupported(Exception):
 
 
 def is_float(x) -> bool:
-    """Whether a vector holds real numbers."""
+    """Return whether a vector holds real numbers."""
     return isinstance(x.type.element, (ir.DoubleType, ir.FloatType))
 
 
@@ -79,7 +79,7 @@ def _compare(sign: str):
 
 
 def _is_a_number(x) -> bool:
-    """Whether a vector is known to hold numbers only."""
+    """Return whether a vector is known to hold numbers only."""
     return isinstance(x, ir.Constant) and not any(math.isnan(number.constant) for number in x.constant)
 
 

@@ -39,7 +39,7 @@ def _condition(program) -> tuple[list, Any] | None:
 
 
 def has_parts(equation) -> bool:
-    """Whether a loop's step has cases that are steps of their own."""
+    """Return whether a loop's step has cases that are steps of their own."""
     return equation.primitive.name == "while" and _condition(equation.params["body_jaxpr"]) is not None
 
 

@@ -48,14 +48,14 @@ def _traced(run: Callable, program: ClosedJaxpr) -> ClosedJaxpr:
 
 @functools.cache
 def is_foreign(primitive) -> bool:
-    """Whether an operation is another library's, written in Python."""
+    """Return whether an operation is another library's, written in Python."""
     rule = getattr(primitive, "impl", None)
     module = getattr(getattr(rule, "func", rule), "__module__", None) or "jax"
     return module.partition(".")[0] not in ("jax", "jaxlib", "jaxrock")
 
 
 def has_foreign(jaxpr) -> bool:
-    """Whether a program holds an operation of another library."""
+    """Return whether a program holds an operation of another library."""
     return any(
         is_foreign(equation.primitive) or any(map(has_foreign, programs_of(equation))) for equation in jaxpr.eqns
     )
@@ -247,7 +247,7 @@ def _stacked(rows: Sequence):
 
 
 def _is_short(turns: int, program: ClosedJaxpr) -> bool:
-    """Whether a loop is to be unrolled."""
+    """Return whether a loop is to be unrolled."""
     return turns <= _TURNS and turns * _size(program.jaxpr) <= _OPERATIONS
 
 
@@ -271,7 +271,7 @@ def _known(x):
 
 
 def _same(x, y) -> bool:
-    """Whether both are known and the same, to the sign of a zero."""
+    """Return whether both are known and the same, to the sign of a zero."""
     is_like = _is_known(x) and _is_known(y) and x.dtype == y.dtype and x.shape == y.shape
     return is_like and x.tobytes() == y.tobytes()
 

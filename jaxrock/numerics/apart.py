@@ -16,7 +16,7 @@ _part_p, _apart_p = Primitive("lanes_part"), Primitive("apart")
 
 
 def lanes_part() -> Bool[Array, ""]:
-    """Whether lanes take different steps without paying for those of all others."""
+    """Return whether lanes take different steps without paying for those of all others."""
     return _part_p.bind()
 
 

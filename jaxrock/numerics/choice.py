@@ -19,5 +19,5 @@ def where(condition: Any, one: Any, other: Any) -> jax.Array:
 
 
 def _yields(value: Any) -> bool:
-    """Whether the type of a number gives way to that of others."""
+    """Return whether the type of a number gives way to that of others."""
     return isinstance(value, (bool, int, float)) or getattr(jax.typeof(value), "weak_type", False)

@@ -97,7 +97,7 @@ def _compiled(primitive: Primitive, settings: tuple) -> Callable:
 
 
 def is_compound(name: str) -> bool:
-    """Whether a primitive of this name consists of others."""
+    """Return whether a primitive of this name consists of others."""
     return name in _OPERATIONS
 
 

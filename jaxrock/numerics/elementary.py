@@ -201,7 +201,7 @@ def tangent(x: Real) -> Real:
 
 @jax.jit
 def _is_negative(x: Real) -> Bool[Array, "..."]:
-    """Whether the sign is minus, of zeros too."""
+    """Return whether the sign is minus, of zeros too."""
     return (x < 0) | ((x == 0) & (1 / x < 0))
 
 

@@ -119,7 +119,7 @@ class _View:
         self.within = jnp.minimum(jnp.minimum(*within), jnp.cbrt(_ratio(self.noise[0], self.third)))
 
     def clear(self, level: Scalar, sign: float) -> tuple[Flag, Scalar]:
-        """Whether the curve touches the level, and a length on which it stays on this side (sign 1: above it).
+        """Return whether the curve touches the level, and a length on which it stays on this side (sign 1: above it).
 
         The longest of many: by parabolas below the slower modes, less the swing of the faster ones. It is zero where
         the curve touches the level and leaves this side, certainly in spite of rounding.

@@ -62,7 +62,7 @@ def _flat(tree: Any) -> tuple[list, Any]:
 
 
 def is_zero(change: Any) -> bool:
-    """Whether a change is zero whatever the numbers are."""
+    """Return whether a change is zero whatever the numbers are."""
     return isinstance(change, SymbolicZero)
 
 

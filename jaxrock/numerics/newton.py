@@ -25,8 +25,8 @@ def _settled(x: Scalar) -> float:
 
 
 def is_found(x: Scalar, change: Scalar, share: float = 1e-7) -> Bool[Array, ""]:
-    """Whether the last change of a root was small enough for it to be one: such a share of it, or in single precision
-    what is left there."""
+    """Return whether the last change of a root was small enough for it to be one: such a share of it, or in single
+    precision what is left there."""
     return change <= max(share, 80 * float(jnp.finfo(x.dtype).eps)) * x
 
 

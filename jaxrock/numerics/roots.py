@@ -98,7 +98,7 @@ def search_root(function: Callable, a: Real, b: Real) -> Real:
 
 
 def _open(a, b, fa, fb, tight):
-    """Whether the bracket is wider than rounding and holds a change of sign."""
+    """Return whether the bracket is wider than rounding and holds a change of sign."""
     wide = jnp.abs(b - a) > tight * jnp.minimum(jnp.abs(a), jnp.abs(b))
     return wide & (fa != 0) & (fb != 0) & ((fa > 0) != (fb > 0))
 

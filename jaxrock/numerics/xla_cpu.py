@@ -22,7 +22,7 @@ _marks = contextvars.ContextVar("marks", default=True)
 
 
 def are_marked() -> bool:
-    """Whether values are marked in what is traced now."""
+    """Return whether values are marked in what is traced now."""
     return _marks.get()
 
 

@@ -1,4 +1,4 @@
-"""Whether pure rocking is a fair model: the friction that it needs, and whether the block stays on the ground."""
+"""Check the model of pure rocking: the friction that it needs, and whether the block stays on the ground."""
 
 import jax
 import jax.numpy as jnp
@@ -57,12 +57,12 @@ class Contact(AbstractTable):
 
     @property
     def keeps_contact(self) -> Bool[Array, ""]:
-        """Whether the ground never had to pull."""
+        """Return whether the ground never had to pull."""
         return self.least_normal > 0
 
     @called_by_users
     def sticks(self, friction: ArrayLike) -> Bool[Array, "..."]:
-        """Whether a coefficient of friction [-] suffices, below the unstable equilibrium and at the impacts."""
+        """Return whether a coefficient of friction [-] suffices, below the unstable equilibrium and at the impacts."""
         needed = self.largest_friction
         for happened, by_impacts in zip(self.impacted, self.friction_at_impact):
             needed = jnp.where(happened, jnp.maximum(needed, by_impacts), needed)
@@ -138,7 +138,8 @@ def _contact(response: Response, block: Block | AsymmetricBlock, ratio: Scalar) 
 def _at_impacts(
     response: Response, side: float, here: tuple[Scalar, Scalar], there: tuple[Scalar, Scalar]
 ) -> tuple[Bool[Array, ""], Scalar]:
-    """Whether impacts end a stay on a side, and the most friction that they need, or any would, if there is none.
+    """Return whether impacts end a stay on a side, and the most friction that they need, or any would, if there is
+    none.
 
     `here`, `there`: horizontal and vertical distance of the centre from the corner that it leaves, and from the other.
     """

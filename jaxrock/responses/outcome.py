@@ -221,7 +221,7 @@ def _to_outcome(block, motion, model, initial, engine, *, taped: bool) -> Outcom
 
 
 def has_one_peak(peak: Scalar, second: Scalar, clearance: Scalar, alpha: Scalar) -> Bool[Array, "..."]:
-    """Whether neither another peak ties with the highest, nor an impact is grazed before it."""
+    """Return whether neither another peak ties with the highest, nor an impact is grazed before it."""
     equal = max(1e-9, ROUNDING * float(jnp.finfo(peak.dtype).eps))
     tie = (peak - second <= equal * peak) & (peak > 0)
     return ~tie & ~(clearance <= equal * alpha)

@@ -1,4 +1,4 @@
-"""Whether a block that is given beside a response is that of the response."""
+"""Check that a block passed beside a response is the block of that response."""
 
 from typing import Any
 

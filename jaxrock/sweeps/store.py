@@ -119,7 +119,7 @@ class Store:
         return sorted(found)
 
     def look(self, number: int) -> tuple[bool, list[Path]]:
-        """Whether a block is finished and good, and its files that are damaged."""
+        """Return whether a block is finished and good, and its files that are damaged."""
         leaves, damaged = self._read(number)
         return leaves is not None, damaged
 

@@ -165,7 +165,7 @@ def _keeper(
 
 
 def _there(store: Store) -> np.ndarray:
-    """Whether every block of a store is finished: each is verified by one of the processes, and all hear of it.
+    """Return whether every block of a store is finished: each is verified by one of the processes, and all hear of it.
 
     What is damaged is named in a warning, and not there.
     """

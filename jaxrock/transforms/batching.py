@@ -91,7 +91,7 @@ class Lanes:
 
     @functools.cached_property
     def in_machine_code(self) -> bool:
-        """Whether machine code of our own runs it."""
+        """Return whether machine code of our own runs it."""
         if not self.on_cpu or self.portable or not self.recipe.in_lanes:
             return False
         if native is None:
@@ -117,7 +117,7 @@ class Lanes:
         return [name for part in [*self._plans(), postponed] if part is not None for name in part.names]
 
     def found(self, code: str) -> bool:
-        """Whether such machine code is there, or kept."""
+        """Return whether such machine code is there, or kept."""
         return native is not None and native.is_there(code)
 
     @property

@@ -141,7 +141,7 @@ class Traced:
 
 
 def _is_compiled(equation) -> bool:
-    """Whether an operation is a call of a function under `jax.jit`."""
+    """Return whether an operation is a call of a function under `jax.jit`."""
     return equation.primitive.name in ("jit", "pjit") and isinstance(equation.params.get("jaxpr"), ClosedJaxpr)
 
 

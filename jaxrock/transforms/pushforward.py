@@ -213,8 +213,8 @@ def _merged(xs: Sequence, moves: Sequence[bool], own: Sequence) -> list:
 
 
 def _has_rules(equation) -> bool:
-    """Whether there may be rules of functions in an operation: these may tell other integers, too, where anything
-    changes."""
+    """Return whether there may be rules of functions in an operation: these may tell other integers, too, where
+    anything changes."""
     return equation.primitive.name in ("while", "cond") or any(x in equation.params for x in ("jaxpr", "call_jaxpr"))
 
 
@@ -264,7 +264,7 @@ def _moving_results(equation, flags: tuple[bool, ...]) -> tuple[bool, ...]:
 
 
 def _is_known(equation) -> bool:
-    """Whether it is known here, or of one result: of many all would be said to change that may."""
+    """Return whether it is known here, or of one result: of many all would be said to change that may."""
     name, parameters = equation.primitive.name, equation.params
     if any(jax.dtypes.issubdtype(v.aval.dtype, np.complexfloating) for v in (*equation.invars, *equation.outvars)):
         return False

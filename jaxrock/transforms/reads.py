@@ -106,7 +106,7 @@ def _of_value(value: Any, seen: dict[int, int]) -> Iterator[Hashable]:
 
 
 def _is_pure(value: Any) -> bool:
-    """Whether it is a function or class that computes from its arguments alone."""
+    """Return whether it is a function or class that computes from its arguments alone."""
     name = getattr(value, "__name__", None)
     if name is None or isinstance(value, types.ModuleType):
         return False

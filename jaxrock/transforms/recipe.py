@@ -153,7 +153,7 @@ class Recipe:
 
     @property
     def holds_traced(self) -> bool:
-        """Whether its function holds traced values of what is around it."""
+        """Return whether its function holds traced values of what is around it."""
         return self.facts is None and any(isinstance(x, jax.core.Tracer) for x in self._first[0].consts)
 
     def __call__(self, leaves: Sequence) -> list:

@@ -22,8 +22,8 @@ def _has_counted(jaxpr: Any) -> bool:
 
 
 def _is_counted(equation: Any) -> bool:
-    """Whether it is a scan without rows: all that it takes and makes is as within. (How JAX tells how many are carried
-    differs from version to version.)"""
+    """Return whether it is a scan without rows: all that it takes and makes is as within. (How JAX tells how many are
+    carried differs from version to version.)"""
     if equation.primitive.name != "scan" or equation.params["jaxpr"].consts:
         return False
     turn = equation.params["jaxpr"]

@@ -25,7 +25,7 @@ def properties(vertices):
 
 
 def simple(vertices):
-    """Whether no two edges of the outline cross or touch except neighbours at their vertex."""
+    """Return whether no two edges of the outline cross or touch except neighbours at their vertex."""
     n = len(vertices)
 
     def turn(p, q, r):

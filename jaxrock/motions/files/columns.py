@@ -97,7 +97,7 @@ def _step_of(name: str, titles: Titles, times: np.ndarray, numbers, printed, dt:
 
 
 def _are_times(values: np.ndarray, dt: float | None = None) -> bool:
-    """Whether numbers rise evenly, by `dt` if that is given, as times do."""
+    """Return whether numbers rise evenly, by `dt` if that is given, as times do."""
     steps = np.diff(values)
     step = dt or (float(np.median(steps)) if steps.size else 0.0)
     return steps.size > 1 and step > 0 and bool((np.abs(steps - step) <= 0.01 * step).all())

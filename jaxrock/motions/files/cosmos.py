@@ -28,7 +28,8 @@ _STEP, _PEAK, _UNKNOWN = 61, 63, -999.0  # places in the real header: time step 
 
 
 def is_spectra(lines: list[str]) -> bool:
-    """Whether these are the lines of a COSMOS V3 file: response spectra, of which the package reads CSMIP's alone."""
+    """Return whether these are the lines of a COSMOS V3 file: response spectra, of which the package reads CSMIP's
+    alone."""
     return any(map(_SPECTRA.match, lines[:3]))
 
 

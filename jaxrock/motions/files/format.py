@@ -34,7 +34,7 @@ class AbstractFormat(abc.ABC):
 
     @abc.abstractmethod
     def recognises(self, lines: list[str]) -> bool:
-        """Whether the lines of a file are of this format, beyond doubt."""
+        """Return whether the lines of a file are of this format, beyond doubt."""
 
     @abc.abstractmethod
     def read(self, name: str, lines: list[str], dt: float | None, unit: str | None, column: int | None) -> Accelerogram:

@@ -51,7 +51,7 @@ def unit_named(written: str) -> str | None:
 
 
 def is_unit(written: str) -> bool:
-    """Whether a word is a unit of acceleration."""
+    """Return whether a word is a unit of acceleration."""
     return unit_named(written) is not None
 
 

@@ -70,13 +70,13 @@ class Title(NamedTuple):
 
     @property
     def is_time(self) -> bool:
-        """Whether it says that the numbers are times."""
+        """Return whether it says that the numbers are times."""
         said = _TIME.fullmatch(" ".join(self.word.replace("_", " ").split()).rstrip("."))
         return bool(said) or not self.bare and _seconds(self.unit)
 
     @property
     def states_unit(self) -> bool:
-        """Whether it states one that is known."""
+        """Return whether it states one that is known."""
         return is_unit(self.unit) or _seconds(self.unit)
 
     def with_unit(self, unit: str) -> "Title":
@@ -123,11 +123,11 @@ class Titles(NamedTuple):
         return SECONDS.get(elsewhere, 1.0), bool(elsewhere)
 
     def is_time(self, column: int) -> bool:
-        """Whether a column is said to hold times."""
+        """Return whether a column is said to hold times."""
         return self._of(column).is_time
 
     def counts(self, column: int) -> bool:
-        """Whether a column is said to count samples."""
+        """Return whether a column is said to count samples."""
         return self._of(column).word.strip(" .").lower() in _COUNTS
 
     def direction(self, column: int) -> str:
@@ -145,7 +145,7 @@ def _seconds(unit: str) -> bool:
 
 
 def _same(one: str, other: str) -> bool:
-    """Whether two spellings are of one unit."""
+    """Return whether two spellings are of one unit."""
     return is_unit(one) and unit_named(one) == unit_named(other)
 
 
@@ -228,25 +228,25 @@ def _said(lines: list[str], width: int) -> dict:
 
 
 def _is_of_a_value(words: str) -> bool:
-    """Whether a unit is that of a value behind it, and says nothing of the columns."""
+    """Return whether a unit is that of a value behind it, and says nothing of the columns."""
     found = _VALUED.match(words[:_LONG])
     # Without a sign between them a number beside a unit of acceleration may be a factor.
     return found is not None and (is_any_unit if found[2] else _seconds)(_inner(found[1]))
 
 
 def _is_plain(titles: list[Title]) -> bool:
-    """Whether words that blanks part are titles, and not just as many as there are columns."""
+    """Return whether words that blanks part are titles, and not just as many as there are columns."""
     first = titles[0].word.lower()
     return first in _COUNTS | _SPECTRUM or all(_DIRECTION.fullmatch(each.word) for each in titles)
 
 
 def is_any_unit(word: str) -> bool:
-    """Whether a word is a unit, of whatever."""
+    """Return whether a word is a unit, of whatever."""
     return is_unit(word) or _seconds(word) or bool(_OTHER_UNIT.fullmatch(word[:_LONG]))
 
 
 def _only_units(titles: list[Title]) -> bool:
-    """Whether a line holds nothing but units, and one of times or accelerations among them."""
+    """Return whether a line holds nothing but units, and one of times or accelerations among them."""
     good = all(
         not each.word and (not each.unit or each.states_unit or _OTHER_UNIT.fullmatch(each.unit)) for each in titles
     )
@@ -314,7 +314,7 @@ def _bare(field: str) -> Title:
 
 
 def _is_bare(text: str) -> bool:
-    """Whether a word without brackets is a unit, beyond doubt."""
+    """Return whether a word without brackets is a unit, beyond doubt."""
     text = text.replace("_", "/")
     if len(text) == 1:
         return text in "gs"  # G and S may be names
