@@ -3,8 +3,8 @@
 The linear phase consists of the tangents at the unstable equilibrium. It is exact near there, and has the frequency and
 decay of every mode. The remainder, the part of the equations beside it, is small or slow.
 
-It is evaluated at Chebyshev points of a step and becomes a polynomial, to which the response of the modes is exact; a
-fixed-point iteration repeats this. So steps are as long as the polynomial is accurate, however stiff the column is.
+It is evaluated at Chebyshev points of a step and becomes a polynomial. The response of the modes to that is exact; a
+fixed-point iteration repeats both. So steps are as long as the polynomial is accurate, however stiff the column is.
 """
 
 from typing import NamedTuple
