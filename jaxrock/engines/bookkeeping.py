@@ -83,7 +83,7 @@ def rounded(stepper: AbstractStepper, state: State, push: Scalar, time: Scalar) 
 def note(stepper: AbstractStepper, state: State, outward, turning, crossing, opening, speed, acceleration) -> State:
     """Update peaks, clearances and the closeness to standing still in balance (see `Outcome.margin`)."""
     moments = stepper.scene.moments
-    # Take the larger acceleration, with or without the shaking: a block that the ground holds for an instant, far from
+    # Take the larger acceleration, with or without the shaking. A block that the ground holds for an instant, far from
     # its saddle, is not in balance.
     pull = jnp.maximum(jnp.abs(acceleration), jnp.abs(moments.restoring(Angle.of(opening))))
     per_rest = 1 / moments.restoring_at_rest**2  # `keep` below has XLA compute the product once

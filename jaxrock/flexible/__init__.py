@@ -1,5 +1,6 @@
-"""Flexible columns on a rocking base: exact in every phase that is linear; what is not is followed beside a linear one.
+"""Flexible columns on a rocking base: exact in every linear phase; a nonlinear remainder is iterated beside a linear
+one.
 
-Imports `engines`, `blocks`, `motions`, `transforms`, `numerics`. Start with `phases`, then `stepper`, then `response`;
-of what is not linear with `column`, then `remainder`, then `nonlinear`.
+Imports `engines`, `blocks`, `motions`, `transforms`, `numerics`. Start with `phases`, then `stepper`, then `response`.
+Nonlinear columns are in `column`, then `remainder`, then `nonlinear`.
 """

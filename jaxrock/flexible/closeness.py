@@ -1,8 +1,10 @@
-"""How near a rocking base comes to standing still in balance: of what the margin of a flexible block is made.
+"""The closeness of a rocking base to standing still in balance, from which the margin of a flexible block follows.
 
-About the balance the base moves by an unstable mode, which grows, and the one that mirrors it, which decays; what is
-left are vibrations. Where the ground rests the sign of what grows is the verdict. With amplitudes g and d [rad] the
-distance is sqrt(2 (g^2 + d^2)); a rigid base that turns back at theta has come as near as balance - theta.
+About the balance the base moves by an unstable mode, which grows, and the one that mirrors it, which decays; the rest
+are vibrations. Where the ground rests, the sign of the growing amplitude is the verdict.
+
+With amplitudes g and d [rad] the distance is sqrt(2 (g^2 + d^2)). A rigid base that turns back at theta has come as
+near as balance - theta.
 """
 
 from typing import NamedTuple
@@ -15,11 +17,11 @@ from jaxrock.flexible.phases import Arc, Phase
 from jaxrock.numerics.roots import implicit
 
 Scalar = Inexact[Array, ""]
-_HALVINGS = 40  # of a step, in which the distance is least
+_HALVINGS = 40  # bisections of a step for its least distance
 
 
 def mirrored(rocking: Phase) -> tuple[Int[Array, ""], Int[Array, ""]]:
-    """Which of the modes grows, and which decays as it grows (a little faster, with damping)."""
+    """Return the index of the growing mode, and of the one that decays as it grows (a little faster, with damping)."""
     grows = jnp.argmax(rocking.rates.real)
     return grows, jnp.argmin(jnp.abs(rocking.rates + rocking.rates[grows]))
 
@@ -33,20 +35,20 @@ class _Near(NamedTuple):
     balance: Scalar
 
     def parts(self, x: Scalar) -> Inexact[Array, " two"]:
-        """What grows and what decays [rad]."""
+        """Return the growing and the decaying amplitude [rad]."""
         return self.side * self.path.mode_amplitudes(x).real[self.modes]
 
     def distance(self, parts: Inexact[Array, "... two"]) -> Inexact[Array, "..."]:
-        """Squared, over that of the block at rest."""
+        """Return the squared distance over that of the block at rest."""
         return 2 * (parts**2).sum(axis=-1) / self.balance**2
 
     def slope(self, x: Scalar) -> Scalar:
-        """How fast the distance grows."""
+        """Return the rate at which the distance grows."""
         return jax.jvp(lambda x: self.distance(self.parts(x)), (x,), (jnp.ones_like(x),))[1]
 
 
 def _to_nearest(told: tuple[_Near, Bool[Array, ""]], x: Scalar) -> Scalar:
-    """How far it is to where the distance is least, if that is inside."""
+    """Return the Newton step to the least distance, if that is inside."""
     near, inside = told
     value, bend = jax.jvp(near.slope, (x,), (jnp.ones_like(x),))
     inside = inside & (bend > 0)
@@ -54,7 +56,8 @@ def _to_nearest(told: tuple[_Near, Bool[Array, ""]], x: Scalar) -> Scalar:
 
 
 def approached(path: Arc, side: Scalar, balance: Scalar, end: Scalar, before: tuple[Scalar, Scalar]) -> tuple:
-    """Closeness, and closeness since the balance was last crossed outward, after the step `path` up to x = `end`."""
+    """Return closeness, and closeness since the last outward crossing of the balance, after the step `path` up to x =
+    `end`."""
     closeness, beyond = before
     near = _Near(path, jnp.stack(mirrored(path.phase)), side, balance)
     still = jax.lax.stop_gradient(end)
@@ -65,7 +68,8 @@ def approached(path: Arc, side: Scalar, balance: Scalar, end: Scalar, before: tu
         falls = near.slope(middle) < 0
         return jnp.where(falls, middle, low), jnp.where(falls, high, middle)
 
-    # Least where it ceases to fall, a place that moves, which second derivatives feel; not where it only rises.
+    # A minimum inside the step moves, which second derivatives feel; one at its start, where the distance only rises,
+    # stays.
     low, high = jax.lax.fori_loop(0, _HALVINGS, halve, (0 * still, still))
     inside = (low > 0) & (high < still)
     place = implicit(_to_nearest, jax.lax.stop_gradient((low + high) / 2), (near, inside))
@@ -78,7 +82,8 @@ def approached(path: Arc, side: Scalar, balance: Scalar, end: Scalar, before: tu
 
 
 def still_to_come(outward: Scalar, inward: Scalar, grows: Scalar, decays: Scalar) -> Scalar:
-    """The least squared distance [rad^2] of free rocking from these amplitudes on; rates [1/s], both positive."""
+    """Return the least squared distance [rad^2] of free rocking from these amplitudes on; rates [1/s], both positive.
+    Return the least squared distance [rad^2] of free rocking from these amplitudes on; rates [1/s], both positive."""
     safe = jnp.where(outward == 0, 1.0, outward)
     time = jnp.log(jnp.maximum(decays * inward**2 / (grows * safe**2), 1.0)) / (2 * (grows + decays))
     nearest = 2 * ((safe * jnp.exp(grows * time)) ** 2 + (inward * jnp.exp(-decays * time)) ** 2)

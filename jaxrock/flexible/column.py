@@ -1,6 +1,6 @@
-"""A flexible column as it is: laws of its base, rotations as large as they are, and its weight where it bends.
+"""A flexible column without linearisation: the law of its base, finite rotations, and its weight as it bends.
 
-Element j of the column leans by psi_j, so that the masses are at L cos(alpha) times sums of sin(psi)/elements, and the
+Element j of the column leans by psi_j, so that the masses are at L cos(alpha) times sums of sin(psi)/elements. The
 elements bend against psi - theta. In units of m L^2, with the moments carried_j and masses sway_jk of `unit_column`,
 
     sum over k of sway_jk [cos(psi_j - psi_k) psi_k'' + sin(psi_j - psi_k) psi_k'^2] + (bending and damping)_j
@@ -25,7 +25,7 @@ Modal = Inexact[Array, " modes"]
 
 
 class Column(eqx.Module):
-    """What the equations need of a block, beside its `Numbers`."""
+    """The constants of a block in the equations, beside its `Numbers`."""
 
     numbers: Numbers
     weight: Scalar  # g/L [1/s^2]
@@ -35,7 +35,7 @@ class Column(eqx.Module):
 
     @classmethod
     def of(cls, block: FlexibleBlock) -> "Column":
-        """Of a block of scalars."""
+        """Collect the constants of a block of scalars."""
         weight = block.gravity / block.length
         return cls(Numbers.of(block), weight, block.base, block.rotations == "finite", block.p_delta)
 
@@ -44,15 +44,15 @@ class Column(eqx.Module):
         return unit_column(self.numbers.rotation.size + 1)
 
     def sine(self, angle):
-        """Its sine, or the angle itself where rotations are small."""
+        """Return the sine of an angle, or the angle itself where rotations are small."""
         return jnp.sin(angle) if self.finite else angle
 
     def _raised(self, angle):
-        """1 - cos(angle), or what small rotations have of it: the integral of `sine`."""
+        """Return 1 - cos(angle), or its small-rotation form: the integral of `sine`."""
         return 2 * jnp.sin(angle / 2) ** 2 if self.finite else angle**2 / 2
 
     def spring(self, rotation: Scalar, side: Scalar) -> Scalar:
-        """Moment of the base; where the weight pulls at the column, without what it pulls at a straight one."""
+        """Return the moment of the base; with P-Delta, without the moment of the weight of a straight column."""
         alpha, half, opening = self.numbers.alpha, self.weight / 2, side * rotation
         # D&F 2017, equations 13, 14, 15.
         if self.base == "sine":
@@ -64,7 +64,7 @@ class Column(eqx.Module):
         return side * (law + half * self.sine(opening)) if self.p_delta else side * law
 
     def potential(self, q: Modal, rotation: Scalar) -> Scalar:
-        """Potential energy of the base and of the weight."""
+        """Return the potential energy of the base and of the weight."""
         alpha, half, opening = self.numbers.alpha, self.weight / 2, jnp.abs(rotation)
         if self.base == "sine":
             energy = half * (jnp.cos(alpha - opening) - jnp.cos(alpha))
@@ -78,24 +78,25 @@ class Column(eqx.Module):
         return energy + half * self._raised(rotation) - self.weight * lowered
 
     def strain(self, q: Modal, rotation: Scalar) -> Scalar:
-        """Energy of bending."""
+        """Return the energy of bending."""
         return jnp.sum(self.numbers.squares * (q - self.numbers.rotation * rotation) ** 2) / 2
 
     def kinetic(self, q: Modal, v: Modal) -> Scalar:
-        """Kinetic energy."""
+        """Return the kinetic energy."""
         if not self.finite:
             return jnp.sum(v**2) / 2
         lean, speed = self._unit.chords @ q, self._unit.chords @ v
         return speed @ (self._unit.sway * jnp.cos(lean[:, None] - lean)) @ speed / 2
 
     def elastic(self, q: Modal, v: Modal, rotation: Scalar, speed: Scalar) -> Modal:
-        """Forces of bending and of its damping on the modes."""
+        """Return the forces of bending and of its damping on the modes."""
         numbers = self.numbers
         bent, bends = q - numbers.rotation * rotation, v - numbers.rotation * speed
         return numbers.squares * bent + numbers.damping * bends
 
     def remaining_force(self, q: Modal, v: Modal, a: Modal, ground: Scalar) -> Modal:
-        """Forces on the modes that small rotations without P-Delta leave out; `ground`: its acceleration [g]."""
+        """Return the forces on the modes that small rotations without P-Delta omit; `ground`: ground acceleration [g].
+        Return the forces on the modes that small rotations without P-Delta omit; `ground`: ground acceleration [g]."""
         unit, numbers = self._unit, self.numbers
         lean, force = unit.chords @ q, jnp.zeros_like(q)
         if self.finite:
@@ -109,12 +110,12 @@ class Column(eqx.Module):
         return force @ unit.chords
 
     def displacements(self, q: Modal) -> Inexact[Array, " masses"]:
-        """Of the masses, from the base to the top, over L cos(alpha)."""
+        """Return the displacements of the masses, from the base to the top, over L cos(alpha)."""
         steps = self.sine(self._unit.chords @ q) / self.numbers.rotation.size
         return jnp.concatenate([jnp.zeros(1), jnp.cumsum(steps)])
 
     def saddle(self) -> tuple[Modal, Scalar]:
-        """Modal displacements and rotation of the unstable equilibrium."""
+        """Return modal displacements and rotation of the unstable equilibrium."""
         numbers = self.numbers
         straight = jnp.append(numbers.rotation, 1.0) * numbers.balance
         if not self.p_delta:
@@ -125,7 +126,7 @@ class Column(eqx.Module):
         return x[:-1], x[-1]
 
     def lack(self, x: Inexact[Array, " unknowns"]) -> Inexact[Array, " unknowns"]:
-        """What modal displacements and a rotation lack to be in balance, as displacements and a rotation."""
+        """Return the residual of the equilibrium at modal displacements and a rotation, in the same units."""
         numbers, q, rotation, none = self.numbers, x[:-1], x[-1], jnp.zeros_like(x[:-1])
         elastic = self.elastic(q, none, rotation, 0 * rotation)
         weighed = (elastic - self.remaining_force(q, none, none, 0 * rotation)) / numbers.squares

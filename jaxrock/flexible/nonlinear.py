@@ -1,6 +1,4 @@
-"""A flexible block whose phases are not linear, on its way: the same steps, as long as what is beside the linear phase
-allows.
-"""
+"""A flexible block with nonlinear phases: the same steps, as long as the remainder of the linear phase allows."""
 
 from dataclasses import replace
 
@@ -18,12 +16,12 @@ from jaxrock.motions.motion import AbstractMotion
 from jaxrock.status import Status
 
 Scalar = Inexact[Array, ""]
-_PRECISION = 10_000  # of a step, in units of the last digit
-_SHORTEST = 1e-12  # step over duration
+_PRECISION = 10_000  # tolerance of a step, in units of rounding
+_SHORTEST = 1e-12  # shortest step over duration
 
 
 class NonlinearScene(FlexibleScene):
-    """A flexible block with a law of its base, with rotations or with a weight that are not linear, under a motion."""
+    """A flexible block under a motion, with a nonlinear base law, finite rotations, or P-Delta."""
 
     tangents: Tangents
 
@@ -33,24 +31,24 @@ class NonlinearScene(FlexibleScene):
         tangents = Tangents.of(Column.of(block))
         numbers = tangents.numbers
         rocking, whole = rocking_phase(numbers)
-        # A column that leans too far before it balances is none of these.
+        # Reject a column that leans too far before it balances.
         whole &= (numbers.balance > 0) & (numbers.balance < jnp.pi / 2) & (numbers.squares > 0).all()
         locked, resets = locked_phase(numbers), resets_of(block)
         return cls(block, ground, stop, numbers, locked, rocking, whole, resets, ground.knots, tangents)
 
     def longest(self, state: FlexibleState) -> Scalar:
-        """How long a step may be [s]."""
+        """Return the longest step [s]."""
         return jnp.minimum(super().longest(state), state.stride)
 
     def arc(self, state: FlexibleState) -> tuple[NonlinearArc, Scalar, Scalar, Bool[Array, ""]]:
-        """The motion from here, as of a linear block, with what is beside that."""
+        """Return the arc from here, as of a linear block, with its remainder."""
         load, length, share, whole = self.load(state)
         phase = Phase.where(state.side == 0, self.locked, self.rocking)
         path = arc(self.numbers, phase, state.side, state.motion, load, length)
         return nonlinear_arc(self.tangents, path, state.side, load, length), length, share, whole
 
     def advance(self, state: FlexibleState) -> FlexibleState:
-        """One step, or none but a shorter stride."""
+        """Advance by one step, or reject it and shorten the stride."""
         path, length, share, whole = self.arc(state)
         allowed = _PRECISION * jnp.finfo(length.dtype).eps * self.numbers.balance
         miss = jax.lax.stop_gradient(path.error / allowed)
@@ -58,7 +56,7 @@ class NonlinearScene(FlexibleScene):
         factor = jnp.where(jnp.isfinite(miss), jnp.clip(0.9 * jnp.maximum(miss, 1e-30) ** -0.1, 0.25, 2.0), 0.25)
         held = jax.lax.stop_gradient(length)
         next_ = self.step_on(state, path, length, share, whole)
-        # A good step tells nothing against as long a one; if it ended with the piece, not even against a longer one.
+        # A good step allows another as long; if it ended with the piece, it may allow a longer one.
         longer = jnp.maximum(factor, 1.0) * held
         next_ = replace(next_, stride=jnp.where(whole, jnp.maximum(longer, state.stride), longer))
         failed = held < _SHORTEST * self.stop
@@ -73,27 +71,28 @@ class NonlinearScene(FlexibleScene):
         return jax.tree.map(lambda a, b: jnp.where(good, a, b), next_, again)
 
     def column(self, motion: Inexact[Array, " states"]) -> Inexact[Array, " masses"]:
-        """Displacements of the masses from the base to the top, over L cos(alpha)."""
+        """Return the displacements of the masses from the base to the top, over L cos(alpha)."""
         return self.tangents.column.displacements(self._clamped(motion)[0])
 
     def energy(self, motion: Inexact[Array, " states"]) -> tuple[Scalar, Scalar, Scalar]:
-        """Kinetic energy, strain energy of the column, potential energy of base and weight, over m L^2 [1/s^2]."""
+        """Return kinetic energy, strain energy of the column, potential energy of base and weight, over m L^2 [1/s^2].
+        Return kinetic energy, strain energy of the column, potential energy of base and weight, over m L^2 [1/s^2]."""
         column, (q, v), rotation = self.tangents.column, self._clamped(motion), motion[-1]
         return column.kinetic(q, v), column.strain(q, rotation), column.potential(q, rotation)
 
     @property
     def summit(self) -> Scalar:
-        """Energy of the unstable equilibrium, over m L^2 [1/s^2]."""
+        """Return the energy of the unstable equilibrium, over m L^2 [1/s^2]."""
         kinetic, strain, potential = self.energy(self.numbers.center)
         return kinetic + strain + potential
 
     def _clamped(self, motion: Inexact[Array, " states"]) -> tuple:
-        """Displacements and velocities of the clamped modes."""
+        """Return displacements and velocities of the clamped modes."""
         return tuple(self.tangents.turn @ x for x in jnp.split(motion[:-1], 2))
 
 
 def scene_of(block: FlexibleBlock, ground: AbstractMotion, stop: Scalar) -> FlexibleScene:
-    """The scene of a block, linear or not, in one precision: the usual."""
+    """Build the scene of a block, linear or not, in the session's default precision."""
     usual = jnp.result_type(float)
     given = block, ground, stop
     block, ground, stop = jax.tree.map(lambda x: x.astype(usual) if eqx.is_inexact_array(x) else x, given)

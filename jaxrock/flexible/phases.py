@@ -6,8 +6,8 @@ Modal coordinates q of the clamped column, with u = L (shapes @ q), and the base
     locked:  theta = 0 while |moment| <= strength,  moment = sum of rotation (k q + d q')
     rocking: sum of rotation (k w + d w') = strength side - spring_rate theta,  w = q - rotation theta
 
-in units of m L^2. While the base rocks this is linear in (q, q', theta), about the unstable equilibrium at
-theta = balance side. Its rates are the zeros of one function; left and right vectors follow from them in closed form.
+in units of m L^2. While the base rocks this is linear in (q, q', theta), about the unstable equilibrium at theta =
+balance side. Its rates are the zeros of one function; left and right vectors follow from them in closed form.
 """
 
 import math
@@ -29,11 +29,11 @@ Scalar = Inexact[Array, ""]
 
 
 class _Damping(NamedTuple):
-    """Damping ratios on which it depends how a column is computed."""
+    """Damping ratios at which the computation changes."""
 
     felt: float  # below it the base follows the column at once
-    least: float  # that is computed with
-    easy: float  # from which on eigenvalues are found as they are
+    least: float  # the least in computations
+    easy: float  # from this on eigenvalues need no continuation
 
 
 _IN_DOUBLE, _IN_SINGLE = _Damping(1e-9, 1e-13, 1e-8), _Damping(1e-5, 1e-6, 1e-5)  # found by trial: rounding decides
@@ -46,7 +46,7 @@ def _limits(dtype) -> _Damping:
 
 
 class Numbers(eqx.Module):
-    """What the equations need of a block, in units of m L^2 and seconds."""
+    """The constants of a block in the equations, in units of m L^2 and seconds."""
 
     squares: Inexact[Array, " modes"]
     damping: Inexact[Array, " modes"]
@@ -62,7 +62,7 @@ class Numbers(eqx.Module):
     damped: Bool[Array, ""]
     lean: Scalar  # displacement of the top with a unit rotation, over L, less 1
     center: Inexact[Array, " states"]  # (q, q', theta) of the unstable equilibrium
-    offsets: Inexact[Array, " outputs"]  # and its outputs
+    offsets: Inexact[Array, " outputs"]  # outputs at the unstable equilibrium
 
     @classmethod
     def of(cls, block: FlexibleBlock) -> "Numbers":
@@ -70,7 +70,7 @@ class Numbers(eqx.Module):
         column = unit_column(block.masses)
         dtype = jnp.result_type(block.width, block.youngs_modulus)
         limits = _limits(dtype)
-        # An undamped column is the limit of damped ones, and moves with its damping as they do.
+        # An undamped column is the limit of damped ones, with the same derivative by the damping.
         ratio = with_derivatives_of(jnp.maximum(block.damping_ratio, limits.least), block.damping_ratio)
         damped = block.damping_ratio >= limits.felt
         block = eqx.tree_at(lambda b: b.damping_ratio, block, ratio)
@@ -100,7 +100,7 @@ class Numbers(eqx.Module):
         )
 
     def moment(self, state: Inexact[Array, " states"]) -> Scalar:
-        """Base moment of the column on a locked base, over m L^2."""
+        """Return the moment of the column on a locked base, over m L^2."""
         q, v = jnp.split(state[:-1], 2)
         return jnp.sum(self.rotation * (self.squares * q + self.damping_at_rest * v))
 
@@ -108,8 +108,8 @@ class Numbers(eqx.Module):
 class Phase(eqx.Module):
     """A linear phase: state = center + Re(modes @ c), c' = rates c + drive a_g, c = project @ (state - center).
 
-    The modes are in the order of their frequencies, so that sums of the first of them are slow.
-    `outputs`: rotation; displacement of the top over L, its bending part; base moment over m L^2.
+    The modes are in the order of their frequencies, so that sums of the first of them are slow. `outputs`: rotation;
+    displacement of the top over L, its bending part; base moment over m L^2.
     """
 
     rates: Complex[Array, " modes"]
@@ -119,7 +119,7 @@ class Phase(eqx.Module):
     outputs: Complex[Array, "outputs modes"]
 
     def in_order(self) -> "Phase":
-        """The modes by their frequencies."""
+        """Sort the modes by their frequencies."""
         order = jnp.argsort(jnp.abs(jax.lax.stop_gradient(self.rates.imag)))
         return Phase(
             self.rates[order], self.modes[:, order], self.project[order], self.drive[order], self.outputs[:, order]
@@ -127,16 +127,16 @@ class Phase(eqx.Module):
 
     @classmethod
     def where(cls, condition, one: "Phase", other: "Phase") -> "Phase":
-        """`one` where the condition holds, else `other`."""
+        """Select `one` where the condition holds, else `other`."""
         return jax.tree.map(lambda a, b: jnp.where(condition, a, b), one, other)
 
 
 def locked_phase(numbers: Numbers) -> Phase:
-    """Every clamped mode by itself; one rate more than needed, to be of the same shape as the rocking phase."""
+    """Compute the clamped modes, with one more rate for the shape of the rocking phase."""
     n = numbers.squares.size
     decay = numbers.mass_damping + numbers.damping
     root = jnp.sqrt((decay**2 / 4 - numbers.squares).astype(jnp.result_type(decay, 1j)))
-    # The slower of two real rates without cancellation.
+    # The slower of two real rates comes from the product: no cancellation.
     fast = -decay / 2 - root
     rates = jnp.stack([numbers.squares / fast, fast])
     spread = 2 * rates + decay
@@ -164,7 +164,7 @@ def locked_phase(numbers: Numbers) -> Phase:
 
 
 def rocking_phase(numbers: Numbers) -> tuple[Phase, Bool[Array, ""]]:
-    """Modes of column and turning base; and whether all of them were found."""
+    """Compute the modes of column and turning base; and whether all of them were found."""
     rates = _rocking_rates(numbers)
     square, decay = numbers.squares, numbers.mass_damping
     at = rates[:, None]
@@ -180,12 +180,12 @@ def rocking_phase(numbers: Numbers) -> tuple[Phase, Bool[Array, ""]]:
     project = (
         jnp.concatenate([numbers.rotation * square * (at + decay) / denominator, shape, of_rotation], axis=1) / slope
     )
-    whole = jnp.abs(project @ modes - jnp.eye(rates.size)).max() < 1e-4  # squared by the correction below
+    whole = jnp.abs(project @ modes - jnp.eye(rates.size)).max() < 1e-4  # the correction below squares the error
     # Without damping the base has no motion of its own: it follows the column.
     relaxing = (rates.imag == 0) & (rates.real == jnp.min(rates.real))
     dropped = relaxing & ~numbers.damped
     project = jnp.where(dropped[:, None], 0.0, project)
-    # Strong damping in proportion to stiffness crowds rates together: the inverse of the modes, once corrected.
+    # Strong damping in proportion to stiffness crowds rates together: correct the inverse of the modes once.
     project = 2 * project - (project @ modes) @ project
     bending = numbers.lean - jnp.sum(numbers.tip * numbers.rotation * inertia / denominator, 1)
     phase = Phase(
@@ -199,7 +199,7 @@ def rocking_phase(numbers: Numbers) -> tuple[Phase, Bool[Array, ""]]:
 
 
 def _characteristic(numbers: Numbers, rates) -> tuple:
-    """The function whose zeros are the rates, and its derivative.
+    """Return the function whose zeros are the rates, and its derivative.
 
     sum of rotation^2 (k + d s) s (s + a0)/(s (s + a0) + k + d s) - spring_rate: its poles are the clamped column's.
     """
@@ -207,17 +207,18 @@ def _characteristic(numbers: Numbers, rates) -> tuple:
     stiffness, inertia = numbers.squares + numbers.damping * s, s * (s + numbers.mass_damping)
     denominator = inertia + stiffness
     weights = numbers.rotation**2
-    # As a sum of weights over 1/stiffness + 1/inertia, it does not cancel.
+    # This form, a sum of weights over 1/stiffness + 1/inertia, has no cancellation.
     value = jnp.sum(weights * stiffness * inertia / denominator, 1) - numbers.spring_rate
     slope = weights * (numbers.damping * inertia**2 + (2 * s + numbers.mass_damping) * stiffness**2) / denominator**2
     return value, jnp.sum(slope, 1)
 
 
 def _rocking_rates(numbers: Numbers) -> Complex[Array, " rates"]:
-    """Zeros of the characteristic function: eigenvalues, polished by Newton's method, which carries derivatives."""
+    """Find the zeros of the characteristic function: eigenvalues, polished by Newton's method, which carries
+    derivatives."""
     held = jax.lax.stop_gradient(numbers)
     limits = _limits(held.squares.dtype)
-    # The matrix of (q, q', theta) is singular without damping: start from a little, and follow the rates from there.
+    # The matrix of (q, q', theta) is singular without damping: start from a little, and continue the rates from there.
     easier = jnp.maximum(limits.easy / jnp.maximum(_ratio(held), limits.least), 1.0)
     damping, n = held.damping * easier, held.squares.size
     looseness = jnp.sum(held.rotation**2 * damping)
@@ -245,7 +246,7 @@ def _to_rates(numbers: Numbers, rates: Complex[Array, " rates"]) -> Complex[Arra
 
 
 def _ratio(numbers: Numbers) -> Scalar:
-    """Damping ratio of the first clamped mode by the column's own damping."""
+    """Return the damping ratio of the first clamped mode by the column's own damping."""
     return numbers.damping[0] / (2 * jnp.sqrt(numbers.squares[0]))
 
 
@@ -258,22 +259,22 @@ class Arc(eqx.Module):
     amplitudes: Complex[Array, " modes"]
     exponents: Complex[Array, " modes"]  # rates times the step
     coefficients: Complex[Array, "terms modes"]
-    errors: Inexact[Array, " modes"]  # of the modes at the start, from rounding
+    errors: Inexact[Array, " modes"]  # rounding errors of the modes at the start
 
     def state(self, x: Scalar) -> Inexact[Array, " states"]:
-        """(q, q', theta) at x."""
+        """Return (q, q', theta) at x."""
         return self.center + (self.phase.modes @ self.mode_amplitudes(x)).real
 
     def outputs(self, x: Scalar) -> Inexact[Array, " outputs"]:
-        """Rotation, top displacement over L, its bending part, base moment over m L^2, at x."""
+        """Return rotation, top displacement over L, its bending part, base moment over m L^2, at x."""
         return self.offsets + (self.phase.outputs @ self.mode_amplitudes(x)).real
 
     def mode_amplitudes(self, x: Scalar) -> Complex[Array, " modes"]:
-        """Of the modes at x."""
+        """Return the amplitudes of the modes at x."""
         return self.amplitudes * jnp.exp(self.exponents * x) + powers(x, len(self.coefficients)) @ self.coefficients
 
     def curves(self) -> Curve:
-        """The outputs as curves (one axis more)."""
+        """Return the outputs as curves (one axis more)."""
         rows = self.phase.outputs
         coefficients = (rows @ self.coefficients.T).real.at[:, 0].add(self.offsets)
         exponents = jnp.broadcast_to(self.exponents, rows.shape)
@@ -281,7 +282,7 @@ class Arc(eqx.Module):
 
 
 def arc(numbers: Numbers, phase: Phase, side: Scalar, state, load: Inexact[Array, " order"], length: Scalar) -> Arc:
-    """The motion from `state` on one side (0: locked) under a_g = sum of load[k] x^k, x = time/length."""
+    """Compute the arc from `state` on one side (0: locked) under a_g = sum of load[k] x^k, x = time/length."""
     center, offsets = side * numbers.center, side * numbers.offsets
     start = phase.project @ (state - center)
     exponents = phase.rates * length
@@ -294,7 +295,10 @@ def arc(numbers: Numbers, phase: Phase, side: Scalar, state, load: Inexact[Array
 
 
 def answers(exponents: Complex[Array, " modes"], count: int) -> Complex[Array, "count terms modes"]:
-    """How modes that start at zero answer x^0, x^1, ...: series of those that hardly turn, polynomials of others."""
+    """Return the response of modes that start at zero to x^0, x^1, ...
+
+    It is a Taylor series for modes that hardly turn, and the polynomial solution for others.
+    """
     slow = jnp.abs(exponents) < 1
     series, follows = jnp.where(slow, exponents, 0.0), jnp.where(slow, 1.0, exponents)
 
@@ -305,12 +309,12 @@ def answers(exponents: Complex[Array, " modes"], count: int) -> Complex[Array, "
 
 
 def rising_terms(exponents: Complex[Array, " modes"]) -> Complex[Array, "terms modes"]:
-    """Series of e^(exponent x), of modes that hardly turn."""
+    """Return the series of e^(exponent x), for modes that hardly turn."""
     return powers(jnp.where(jnp.abs(exponents) < 1, exponents, 0.0), _TERMS) / _FACTORIALS[:, None]
 
 
 def _series(exponents, start, drive, load) -> Complex[Array, "terms modes"]:
-    """Taylor coefficients of c' = exponent c + drive load(x), for modes that hardly turn within the step."""
+    """Return Taylor coefficients of c' = exponent c + drive load(x), for modes that hardly turn within the step."""
     rising = powers(exponents, _TERMS)
     derivatives = _FACTORIALS[: load.size] * load
     # Coefficient k + 1 of the answer, times its factorial: sum over j of load's derivative j times exponent^(k - j).
@@ -322,7 +326,7 @@ def _series(exponents, start, drive, load) -> Complex[Array, "terms modes"]:
 
 
 def _follows(exponents, drive, load) -> Complex[Array, "terms modes"]:
-    """The polynomial that solves c' = exponent c + drive load(x), for modes that turn."""
+    """Return the polynomial that solves c' = exponent c + drive load(x), for modes that turn."""
     derivatives = _FACTORIALS[: load.size] * load
     order = np.add.outer(np.arange(_TERMS), np.arange(load.size))
     known = order < load.size

@@ -1,9 +1,10 @@
-"""The motion of a column that is not linear: the linear phase about its balance, and a polynomial of the remainder.
+"""The motion of a nonlinear column: the linear phase about its balance, and a polynomial of the remainder.
 
-The linear phase is that of the tangents at the unstable equilibrium, so that it is exact near there and knows how fast
-every mode turns and fades. The remainder, what the column has beside it, is small or slow: it is taken at Chebyshev
-points of a step, made a polynomial, and the modes answer it exactly; that is repeated until it stays. So steps are as
-long as the polynomial holds, however stiff the column is.
+The linear phase consists of the tangents at the unstable equilibrium. It is exact near there, and has the frequency and
+decay of every mode. The remainder, the part of the equations beside it, is small or slow.
+
+It is evaluated at Chebyshev points of a step and becomes a polynomial. The response of the modes to that is exact; a
+fixed-point iteration repeats both. So steps are as long as the polynomial is accurate, however stiff the column is.
 """
 
 from typing import NamedTuple
@@ -22,17 +23,17 @@ Scalar = Inexact[Array, ""]
 States = Inexact[Array, "points states"]
 
 POINTS = 11
-_ROUNDS = 8  # of taking what is beside the linear phase, and answering it
+_ROUNDS = 8  # fixed-point iterations of remainder and response
 _PLACES = (1 - np.cos(np.pi * np.arange(POINTS) / (POINTS - 1))) / 2
 
 
 def _tables() -> tuple[np.ndarray, np.ndarray]:
-    """Matrices that take values at the points to Chebyshev coefficients, and to those of powers."""
+    """Compute the matrices from values at the points to Chebyshev coefficients, and to those of powers."""
     k = np.arange(POINTS)
     weight = np.where((k == 0) | (k == POINTS - 1), 0.5, 1.0)
     waves = np.cos(np.pi * np.outer(k, (POINTS - 1) - k) / (POINTS - 1))
     spectrum = 2 / (POINTS - 1) * weight[:, None] * waves * weight
-    # T_k(2 x - 1) in powers of x: whole numbers.
+    # T_k(2 x - 1) in powers of x has integer coefficients.
     shapes = [np.polynomial.Polynomial([1.0]), np.polynomial.Polynomial([-1.0, 2.0])]
     for _ in range(POINTS - 2):
         shapes.append(2 * shapes[1] * shapes[-1] - shapes[-2])
@@ -41,23 +42,23 @@ def _tables() -> tuple[np.ndarray, np.ndarray]:
 
 
 _SPECTRUM, _POWERS = _tables()
-_SLOPE = np.diag(np.arange(1.0, POINTS), 1)  # coefficients to those of the derivative
+_SLOPE = np.diag(np.arange(1.0, POINTS), 1)  # maps coefficients to those of the derivative
 
 
 class Tangents(eqx.Module):
-    """The linear column about its unstable equilibrium, in modes in which its weight does not couple them."""
+    """The linear column about its unstable equilibrium, in modes that its weight does not couple."""
 
     column: Column
     numbers: Numbers
-    turn: Inexact[Array, "modes modes"]  # clamped modes of these
-    pull: Inexact[Array, "modes modes"]  # of the weight on these
-    force: Inexact[Array, " modes"]  # of the weight on clamped modes, in balance
-    moment: Scalar  # of the spring, in balance
-    slope: Scalar  # of the spring, there
+    turn: Inexact[Array, "modes modes"]  # columns: these modes in terms of the clamped modes
+    pull: Inexact[Array, "modes modes"]  # stiffness of the weight in these modes
+    force: Inexact[Array, " modes"]  # force of the weight on clamped modes, in balance
+    moment: Scalar  # moment of the spring, in balance
+    slope: Scalar  # slope of that moment, in balance
 
     @classmethod
     def of(cls, column: Column) -> "Tangents":
-        """Of a column."""
+        """Linearise a column."""
         numbers, n = column.numbers, column.numbers.rotation.size
         one, none = jnp.ones(()), jnp.zeros(n)
         q, rotation = column.saddle()
@@ -94,7 +95,7 @@ class Tangents(eqx.Module):
         return cls(column, about, turn, turn.T @ pull @ turn, force, moment, slope)
 
     def remainder(self, state, rate, ground: Scalar, side: Scalar) -> "Remainder":
-        """What is beside the linear phase, at a state (q, q', theta) and its rate of change."""
+        """Return the remainder at a state (q, q', theta) and its rate of change."""
         column, about, n = self.column, self.numbers, self.numbers.rotation.size
         q, v, rotation = state[:n], state[n:-1], state[-1]
         amplitudes, speeds, rates = (self.turn @ x for x in (q, v, rate[n:-1]))
@@ -104,7 +105,7 @@ class Tangents(eqx.Module):
         moment = column.spring(rotation, side) - side * self.moment - self.slope * away
         lost = jnp.zeros(())
         if column.p_delta:
-            # Damping, which couples the modes of the column under its weight a little.
+            # Damping couples the modes of the column under its weight a little.
             own = column.numbers.damping * (self.turn @ v - column.numbers.rotation * rate[-1])
             shared = about.damping * (v - about.rotation * rate[-1])
             force, lost = force + shared - own @ self.turn, about.rotation @ shared - column.numbers.rotation @ own
@@ -115,7 +116,8 @@ class Tangents(eqx.Module):
 
 
 class Remainder(NamedTuple):
-    """What is beside the linear phase: forces on modes, moment at the base; and beside its outputs."""
+    """The part of the equations beside the linear phase: forces on modes, moment at the base; and its part of the
+    outputs."""
 
     force: Inexact[Array, "*points modes"]
     moment: Inexact[Array, "*points"]
@@ -124,32 +126,32 @@ class Remainder(NamedTuple):
 
 
 class NonlinearArc(Arc):
-    """The motion from a state on, with what is beside the linear phase."""
+    """The motion from a state on, with the remainder."""
 
-    shift: Inexact[Array, " terms"]  # of the rotation
-    remainder: Inexact[Array, "outputs terms"]  # of the outputs
-    doubts: Inexact[Array, " outputs"]  # how far polynomials may be off
-    error: Scalar  # of the whole step [rad]
+    shift: Inexact[Array, " terms"]  # of the rotation, by powers of x
+    remainder: Inexact[Array, "outputs terms"]  # of the outputs, by powers of x
+    doubts: Inexact[Array, " outputs"]  # errors of these polynomials
+    error: Scalar  # error of the whole step [rad]
 
     def mode_amplitudes(self, x: Scalar) -> Inexact[Array, " modes"]:
-        """Of the modes at x, with their share in what shifts the rotation."""
+        """Return the amplitudes of the modes at x, with their share of the shift of the rotation."""
         return super().mode_amplitudes(x) + self.phase.project[:, -1] * self._shift(x)
 
     def _shift(self, x: Scalar) -> Scalar:
         return powers(x, self.shift.size) @ self.shift
 
     def state(self, x: Scalar) -> Inexact[Array, " states"]:
-        """(q, q', theta) at x."""
+        """Return (q, q', theta) at x."""
         state = self.center + (self.phase.modes @ super().mode_amplitudes(x)).real
         return state.at[-1].add(self._shift(x))
 
     def outputs(self, x: Scalar) -> Inexact[Array, " outputs"]:
-        """Rotation, top displacement over L cos(alpha), its bending part, base moment over m L^2, at x."""
+        """Return rotation, top displacement over L cos(alpha), its bending part, base moment over m L^2, at x."""
         linear = self.offsets + (self.phase.outputs @ super().mode_amplitudes(x)).real
         return linear + self.remainder @ powers(x, self.shift.size)
 
     def curves(self) -> Curve:
-        """The outputs as curves; the errors of polynomials are those of a mode that is not there, and turns fast."""
+        """Return the outputs as curves. The errors of polynomials appear as those of an absent mode that turns fast."""
         linear, none = super().curves(), jnp.zeros((len(self.doubts), 1))
         return Curve(
             jnp.concatenate([linear.amplitudes, none], 1),
@@ -160,7 +162,7 @@ class NonlinearArc(Arc):
 
 
 class _Step(eqx.Module):
-    """One step of a linear phase, with tables of how its modes answer powers of x."""
+    """One step of a linear phase, with tables of the response of its modes to powers of x."""
 
     tangents: Tangents
     path: Arc
@@ -171,7 +173,8 @@ class _Step(eqx.Module):
     rising: Inexact[Array, "terms modes"]
 
     def arc(self, force, shift) -> tuple:
-        """Amplitudes and coefficients of the modes with these forces and this shift of the rotation (powers of x)."""
+        """Return amplitudes and coefficients of the modes under these forces and this shift of the rotation (powers of
+        x)."""
         numbers, path, n = self.tangents.numbers, self.path, self.tangents.numbers.rotation.size
         onto, turned = path.phase.project[:, n:-1], path.phase.project[:, -1]
         total = force + shift[:, None] * (numbers.rotation * numbers.squares)
@@ -182,7 +185,7 @@ class _Step(eqx.Module):
         return amplitudes, path.coefficients + answer + jnp.where(slow, start * self.rising, 0.0)
 
     def remainder(self, amplitudes, coefficients, shift) -> tuple[Remainder, Inexact[Array, "points modes"]]:
-        """What is beside the linear phase at the points, and its modes there."""
+        """Return the remainder at the points, and the modes there."""
         path, x = self.path, jnp.asarray(_PLACES, coefficients.real.dtype)
         terms = np.arange(len(coefficients))
         waves = amplitudes * jnp.exp(path.exponents * x[:, None])
@@ -197,7 +200,7 @@ class _Step(eqx.Module):
         return found, modes
 
     def shift(self, found: Remainder) -> Inexact[Array, " points"]:
-        """By how much the moment beside the linear phase turns the base against the column."""
+        """Return the rotation of the base against the column that balances the moment of the remainder."""
         numbers = self.tangents.numbers
         stiffness = jnp.sum(numbers.rotation**2 * numbers.squares) - numbers.spring_rate
         return jnp.where(self.side == 0, 0.0, -found.moment / stiffness)
@@ -206,7 +209,7 @@ class _Step(eqx.Module):
 def nonlinear_arc(
     tangents: Tangents, path: Arc, side: Scalar, load: Inexact[Array, " order"], length: Scalar
 ) -> NonlinearArc:
-    """The arc with what is beside its linear phase; `load`: the ground's acceleration [g] by powers of x."""
+    """Compute the arc with its remainder; `load`: the ground acceleration [g] by powers of x."""
     terms = len(path.coefficients)
     ground = powers(jnp.asarray(_PLACES, load.dtype), load.size).T @ load
     step = _Step(tangents, path, side, ground, length, answers(path.exponents, POINTS), rising_terms(path.exponents))
@@ -214,7 +217,7 @@ def nonlinear_arc(
     force, shift = jnp.zeros((POINTS, n)), jnp.zeros(POINTS)
 
     def followed(carry):
-        """Where forces and shift lead: modes and what is beside the linear phase there."""
+        """Compute the modes under the present forces and shift, and the remainder there."""
         (force, shift, *_), _ = carry
         amplitudes, coefficients = step.arc(force, shift)
         return amplitudes, coefficients, *step.remainder(amplitudes, coefficients, shift)
@@ -225,7 +228,7 @@ def nonlinear_arc(
         *_, found, modes = led
         moved = jnp.max(jnp.abs(modes - held[2]))
         following = _POWERS @ found.force, _POWERS @ step.shift(found), modes, moved
-        # The last round only looks. Where rounding is all that is left, stiff modes let it grow again.
+        # The last round only compares. At rounding level, stiff modes make the change grow again.
         better = (number < _ROUNDS) & ((number < 3) | (moved < held[3]))
         return tuple(jnp.where(better, new, old) for new, old in zip(following, held)), led
 
@@ -239,7 +242,7 @@ def nonlinear_arc(
     outputs = jnp.stack([turned, found.displacement, found.bending - turned, jnp.zeros(POINTS)], 1)
     tails = _tail(outputs)
     onto = jnp.abs(path.phase.project[:, n:-1])
-    rounding = 8 * jnp.finfo(tails.dtype).eps * tangents.numbers.balance  # which no shorter step makes smaller
+    rounding = 8 * jnp.finfo(tails.dtype).eps * tangents.numbers.balance  # no shorter step makes it smaller
     turns = jnp.maximum(tails[0] - rounding, 0.0)
     forced = onto @ (_tail(found.force) + turns * jnp.abs(tangents.numbers.rotation * tangents.numbers.squares))
     forced = jnp.max(forced * length / (1 + jnp.abs(path.exponents)))
@@ -254,5 +257,5 @@ def nonlinear_arc(
 
 
 def _tail(values: Inexact[Array, "points *more"]) -> Inexact[Array, "*more"]:
-    """Size of the last two Chebyshev coefficients."""
+    """Return the size of the last two Chebyshev coefficients."""
     return jnp.max(jnp.abs(_SPECTRUM[-2:] @ values), 0)

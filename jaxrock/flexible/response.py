@@ -1,4 +1,5 @@
-"""What a flexible block does under a motion: `simulate_flexible` gives its history, `outcome_flexible` the outcome."""
+"""The response of a flexible block to a motion: `simulate_flexible` gives its history, `outcome_flexible` the outcome.
+The response of a flexible block to a motion: `simulate_flexible` gives its history, `outcome_flexible` the outcome."""
 
 from typing import Annotated, Any
 
@@ -49,7 +50,7 @@ class FlexibleResponse(AbstractTable):
 
     @called_by_users
     def __call__(self, time: Values) -> tuple[Inexact[Array, "..."], Inexact[Array, "..."], Inexact[Array, "..."]]:
-        """Base rotation [rad], displacement of the top [m], and its bending part [m].
+        """Return base rotation [rad], displacement of the top [m], and its bending part [m].
 
         **Arguments:**
 
@@ -63,7 +64,7 @@ class FlexibleResponse(AbstractTable):
 
     @called_by_users
     def column(self, time: Values) -> Inexact[Array, "..."]:
-        """Displacements of the masses relative to the ground [m], from the base (which stays) to the top.
+        """Return the displacements of the masses relative to the ground [m], from the base (which stays) to the top.
 
         **Arguments:**
 
@@ -77,7 +78,7 @@ class FlexibleResponse(AbstractTable):
 
     @called_by_users
     def energy(self, time: Values) -> tuple[Inexact[Array, "..."], Inexact[Array, "..."], Inexact[Array, "..."]]:
-        """Kinetic, strain and base's potential energy, of a block 1 m deep [J]."""
+        """Return kinetic, strain and base's potential energy, of a block 1 m deep [J]."""
         block = self.scene.block
         scale = block.density * block.width * block.height * block.length**2
         parts = _at_times(self.trajectory, self.trajectory.checked(time), "energy")
@@ -85,17 +86,17 @@ class FlexibleResponse(AbstractTable):
 
     @property
     def scene(self) -> FlexibleScene:
-        """What was simulated."""
+        """The scene that was simulated."""
         return self.trajectory.stepper
 
     @property
     def duration(self) -> Inexact[Array, "..."]:
-        """How long the block was followed [s]."""
+        """Length of the history [s]."""
         return self.trajectory.duration
 
     @property
     def status(self) -> Status:
-        """What the numbers are worth."""
+        """The `Status` of the computation: any other than successful invalidates the numbers."""
         return self.outcome.status
 
     @property
@@ -120,8 +121,10 @@ class FlexibleResponse(AbstractTable):
 
     @property
     def impact_modes(self) -> Inexact[Array, "impacts modes"]:
-        """Share of each clamped mode of the column in the energy just after each impact [-]; with P-Delta the modes are
-        those of the column under its weight, about the balance."""
+        """Share of each clamped mode of the column in the energy just after each impact [-].
+
+        With P-Delta the modes are those of the column under its weight, about the balance.
+        """
         return self.trajectory.events(_modes_of)[0]
 
 
@@ -135,7 +138,7 @@ def _modes_of(_, path: Trajectory) -> tuple:
 
 @jax.jit
 def _shares(motion: Scalar, squares: Scalar) -> Scalar:
-    """Of each mode in the energy at each step."""
+    """Return the share of each mode in the energy at each step."""
     q, v = jnp.split(motion[:, :-1], 2, axis=1)
     energies = v**2 + squares * q**2
     total = energies.sum(1, keepdims=True)
@@ -151,20 +154,20 @@ def outcome_flexible(
     max_steps: Annotated[int | None, at_least(1, 10**9)] = None,
     throw: bool = True,
 ) -> FlexibleOutcome:
-    """Tell what becomes of a flexible block under a motion.
+    """Compute the outcome of a flexible block under a motion.
 
     **Arguments:**
 
     - `block`: a `FlexibleBlock` of scalars (use `jax.vmap` for many).
     - `motion`: any horizontal motion; the ground rests after its end.
-    - `duration`: how long to follow the block [s], positive; None: the motion and 10/p of free rocking.
-    - `max_steps`: budget of steps besides four for each piece of the motion, at least 1; None: 4,096, or 32,768 where
-      phases are not linear (then every vibration that matters takes a step a turn or so).
+    - `duration`: time for which to follow the block [s], positive; None: the motion and 10/p of free rocking.
+    - `max_steps`: budget of steps besides four for each piece of the motion, at least 1. None: 4,096, or 32,768 where
+      phases are not linear (then every vibration that matters takes about a step a cycle).
     - `throw`: as in `outcome`.
 
-    **Returns:** a `FlexibleOutcome`. Its derivatives (forward and reverse) by block and motion are exact. Its verdict,
-    where the block is still rocking at the end, is that of the balance's own modes: exact where phases are linear, and
-    near the balance where they are not.
+    **Returns:** a `FlexibleOutcome`. Its derivatives (forward and reverse) by block and motion are exact. Where the
+    block is still rocking at the end, the modes about the balance give the verdict. That is exact where phases are
+    linear, and near the balance where they are not.
 
     **Raises:** ValueError for arguments outside their ranges.
     """
@@ -189,8 +192,8 @@ def simulate_flexible(
     **Arguments:**
 
     - `block`, `motion`, `duration`, `max_steps`, `throw`: as in `outcome_flexible`.
-    - `samples`: number of equally spaced points of the ready-made history, at least 2; any other time is had by
-      calling the result.
+    - `samples`: number of equally spaced points of the ready-made history, at least 2; a call of the result gives any
+      other time.
 
     **Returns:** a `FlexibleResponse`.
 
@@ -208,7 +211,7 @@ def simulate_flexible(
 def _given(
     block: FlexibleBlock, motion: AbstractMotion, duration: ArrayLike | None, throw: bool
 ) -> tuple[FlexibleBlock, AbstractMotion, Scalar]:
-    """What is followed, and how long."""
+    """Check the arguments, and return block, motion and duration."""
     if throw:
         return block, motion, _duration(block, motion, duration, throw)
     block, motion = still_if_none((block, motion))
@@ -254,13 +257,13 @@ def _simulate(block, motion, stop, budget: int) -> tuple[FlexibleOutcome, Trajec
         impacted = nodes.impacted & (jnp.arange(times.size) > 0) & jnp.isfinite(times)
         return scene.conclude(state), Trajectory(scene, nodes, times, impacted, given[-1])
 
-    # Slopes of all steps by every sample of a record would be too many.
+    # A full Jacobian of all steps by every sample of a record would be too large.
     return differentiable(run, derivatives="a few at once")((block, motion, stop))
 
 
 @by_numpy_or_one_program(static_argnums=2)
 def _at_times(path: Trajectory, time, what: str):
-    """Outputs, displacements of the masses, or energies, at times."""
+    """Evaluate outputs, displacements of the masses, or energies, at times."""
     return _after_nodes(path.stepper, *path.before(time, path.nodes), path.duration, time.shape, what)
 
 
@@ -271,7 +274,7 @@ def _after_nodes(scene, node, elapsed, duration, shape, what: str):
 
     def follow(node, elapsed):
         curve, length, _, _ = scene.arc(node)
-        # The last node is the end of the history; but time goes through it.
+        # The last node is the end of the history, but the derivative by time passes through it.
         x = jnp.where(node.done, elapsed - jax.lax.stop_gradient(elapsed), elapsed) / length
         if what == "outputs":
             return tuple(curve.outputs(x) * scales)

@@ -1,7 +1,7 @@
-"""A flexible block on its way under a motion: its state, one step, and what came of it.
+"""A flexible block under a motion: its state, one step, and its outcome.
 
-Each phase (locked base, rocking on either corner) is linear, so a step is exact: a sum of exponentials, and the
-polynomial that answers the motion's Taylor series. Steps end where the series does, at knots, and at events.
+Each phase (locked base, rocking on either corner) is linear, so a step is exact. It is a sum of exponentials and the
+polynomial response to the motion's Taylor series. Steps end where the series loses accuracy, at knots, and at events.
 """
 
 from dataclasses import replace
@@ -25,33 +25,33 @@ from jaxrock.status import Status
 from jaxrock.transforms.differentiation import with_derivatives_of
 
 Scalar = Inexact[Array, "..."]
-_ORDER = 16  # of the motion's Taylor series
+_ORDER = 16  # order of the motion's Taylor series
 
 
 class FlexibleState(eqx.Module):
-    """A flexible block on its way, and what it has seen so far."""
+    """State of a flexible block, and extremes so far."""
 
     piece: Int[Array, ""]
     local: Scalar  # time since the start of the piece [s]
     motion: Inexact[Array, " states"]  # (q, q', theta)
     side: Scalar  # 0: the base is locked
-    last_side: Scalar  # from which the base returned last
-    stay: Scalar  # how long the base has rocked on this side [s]
+    last_side: Scalar  # side from which the base returned last
+    stay: Scalar  # time for which the base has rocked on this side [s]
     braked_stay: Scalar  # the stay that the last impact ended [s]
     maxima: Inexact[Array, " six"]  # of rotation, top displacement over L, its bending part; of their negatives
     closeness: Scalar  # smallest squared distance from standing still in balance (`margin`)
-    closeness_beyond: Scalar  # the same since the balance was last crossed outward
+    closeness_beyond: Scalar  # `closeness` since the last outward crossing of the balance
     impacts: Int[Array, ""]
-    impacted: Bool[Array, ""]  # just now
+    impacted: Bool[Array, ""]  # an impact made this state
     fallen: Bool[Array, ""]
-    stride: Scalar  # how long a step may be, by what is beside the linear phase [s]
+    stride: Scalar  # longest step that the remainder allows [s]
     done: Bool[Array, ""]
     status: Status
     steps: Int[Array, ""]
 
 
 class FlexibleOutcome(AbstractTable):
-    """What came of a flexible block within a duration.
+    """Outcome of a flexible block within a duration.
 
     - `max_rotation`: largest |rotation| of the base [rad]; infinite if the block overturned.
     - `max_displacement`: largest |displacement| of the top relative to the ground [m]; infinite if it overturned.
@@ -59,12 +59,12 @@ class FlexibleOutcome(AbstractTable):
     - `impact_count`: impacts within the duration.
     - `overturned`: the verdict, which looks beyond a duration that covers the motion.
     - `margin`: signed distance to overturning [-], by the rocking part of the motion (its unstable mode and the one
-      that mirrors it, without vibrations): 1 if the base has not turned, positive if the block survives, zero where
-      it comes to balance, negative if it overturns. Of rigid and undamped rocking it is (1 - peak/balance)^2.
-    - `energy`: energy at the end over that of the unstable equilibrium [-]; below 1 no block overturns by itself
-      unless it is already beyond.
-    - `status`: a `Status`; `undecided` if, at the end, the block would overturn by itself, or has the energy to, but is
-      not lost, which it is not known to be while the ground shakes.
+      that mirrors it, without vibrations). It is 1 if the base has not turned, positive if the block survives, zero
+      where it comes to balance, negative if it overturns. For rigid and undamped rocking it is (1 - peak/balance)^2.
+    - `energy`: energy at the end over that of the unstable equilibrium [-]. Below 1 a block that is not already beyond
+      cannot overturn by itself.
+    - `status`: a `Status`. It is `undecided` if, at the end, the block would overturn by itself, or has the energy to,
+      but is not lost. While the ground shakes, a loss is not known.
     """
 
     max_rotation: Scalar
@@ -85,14 +85,14 @@ class FlexibleOutcome(AbstractTable):
 
 
 def resets_of(block: FlexibleBlock) -> tuple[Reset, ...]:
-    """The impacts that end the stays on side 1 and on side 2, or one for both."""
+    """Return the impacts that end the stays on side 1 and on side 2, or one for both."""
     one, other = on_sides(block.law, block.corners)
     corners = (one,) if one is other else (one, other)
     return tuple(Reset.of(block.law, each, jnp.ones_like(block.alpha), 1.0) for each in corners)
 
 
 def _may_be(block: FlexibleBlock, ground: AbstractMotion) -> Bool[Array, ""]:
-    """Return whether no step of an optimiser has made of block or motion what a constructor refuses."""
+    """Return whether block and motion pass the checks of constructors, which a step of an optimiser may bypass."""
     knots = ground.knots
     forward = (knots[0] >= 0) & (knots[-1] >= 0) & (ground.lengths >= 0).all()
     return is_possible(block) & forward
@@ -104,7 +104,7 @@ def _ratio(resets: tuple[Reset, ...], side: Scalar, speed: Scalar) -> Scalar:
 
 
 class FlexibleScene(eqx.Module):
-    """A flexible block under a motion, reduced to what a step needs."""
+    """A flexible block under a motion, reduced to the constants of a step."""
 
     block: FlexibleBlock
     ground: AbstractMotion
@@ -125,7 +125,7 @@ class FlexibleScene(eqx.Module):
         return cls(block, ground, stop, numbers, locked_phase(numbers), rocking, whole, reset, ground.knots)
 
     def start(self) -> FlexibleState:
-        """At rest at time 0."""
+        """Return the state at rest at time 0."""
         n = 2 * self.numbers.rotation.size + 1
         zero, count, no = jnp.zeros(()), jnp.zeros((), jnp.int32), jnp.zeros((), bool)
         finite = jnp.isfinite(self.rocking.rates).all() & jnp.isfinite(self.stop) & _may_be(self.block, self.ground)
@@ -151,22 +151,25 @@ class FlexibleScene(eqx.Module):
         )
 
     def time(self, state: FlexibleState) -> Scalar:
-        """Time of a state [s]."""
+        """Return the time of a state [s]."""
         return self.knots[state.piece] + state.local
 
     def longest(self, state: FlexibleState) -> Scalar:
-        """How long a step may be [s]: grown by more than e^10, the unstable mode would hide the others."""
+        """Return the longest step [s]: after a growth of more than e^10, the unstable mode would hide the others."""
         return 10 / jax.lax.stop_gradient(jnp.max(self.rocking.rates.real))
 
     def arc(self, state: FlexibleState) -> tuple[Arc, Scalar, Scalar, Bool[Array, ""]]:
-        """The motion from here: the arc, its length [s], the share of it that belongs to this piece (1, or 0 of a
-        piece without length), and whether it ends with the piece."""
+        """Return the arc from this state, its length [s], the share of it within this piece, and whether it ends with
+        the piece.
+
+        The share is 1, or 0 in a zero-length piece.
+        """
         load, length, share, whole = self.load(state)
         phase = Phase.where(state.side == 0, self.locked, self.rocking)
         return arc(self.numbers, phase, state.side, state.motion, load, length), length, share, whole
 
     def load(self, state: FlexibleState) -> tuple[Inexact[Array, " order"], Scalar, Scalar, Bool[Array, ""]]:
-        """The ground's acceleration [g] along the arc from here, and the rest that `arc` returns."""
+        """Return the ground acceleration [g] along the arc from here, and the rest that `arc` returns."""
         quiet, inner = state.piece >= self.knots.size - 1, jnp.minimum(state.piece, self.knots.size - 2)
         lasts = jnp.where(quiet, jnp.inf, self.ground.lengths[inner])
         remaining = jnp.minimum(lasts, self.stop - self.knots[state.piece]) - state.local
@@ -176,7 +179,7 @@ class FlexibleScene(eqx.Module):
         room = jnp.where(left > 0, left, jax.lax.stop_gradient(lasts))
         unit = jnp.where(jnp.isfinite(scale), scale, jnp.where(jnp.isfinite(room) & (room > 0), room, 1.0))
         load = jnp.where(quiet, 0.0, jnp.stack(self.ground.series(inner, state.local, unit, _ORDER)))
-        # Where nothing of a piece is left, an arc as long as any: of a longer one large terms cancel even at its start.
+        # At the end of a piece, take an arc of usual length: in a longer one, large terms cancel even at its start.
         cap = jnp.minimum(jnp.where(left > 0, left, unit), self.longest(state)) / unit
         if len(load) > 4:
             size = jnp.finfo(left.dtype).eps / 4 * jnp.max(self.ground.bounds)
@@ -186,13 +189,13 @@ class FlexibleScene(eqx.Module):
         return load * powers(length / unit, len(load)), length, share, whole
 
     def advance(self, state: FlexibleState) -> FlexibleState:
-        """One step: to an event, to the end of a piece, or as far as the motion's series holds."""
+        """Advance by one step: to an event, to the end of a piece, or as far as the motion's series is accurate."""
         return self.step_on(state, *self.arc(state))
 
     def step_on(
         self, state: FlexibleState, path: Arc, length: Scalar, share: Scalar, whole: Bool[Array, ""]
     ) -> FlexibleState:
-        """One step along an arc."""
+        """Advance along an arc."""
         rows = path.curves()
         turned, moment = (jax.tree.map(lambda x, i=i: x[i], rows) for i in (0, 3))
         rocking, limit = state.side != 0, self.numbers.strength
@@ -210,7 +213,7 @@ class FlexibleScene(eqx.Module):
         at_end = ~(below | above) & (x >= jax.lax.stop_gradient(share))
         nearer = x - jax.lax.stop_gradient(value - level) / jnp.where(hit, slope, 1.0)
         x = jnp.where(hit, implicit(_to_level, nearer, (watched, level)), jnp.where(at_end, share, x))
-        slope = with_derivatives_of(slope, watched.jet(x)[1])  # as it was found, with those of where the step ends
+        slope = with_derivatives_of(slope, watched.jet(x)[1])  # value as found, derivatives of the step's end
         motion = path.state(x)
         maxima, certain = _maxima(rows, state.maxima, x)
         status = Status.where(certain, state.status, Status.solver_failed)
@@ -220,10 +223,10 @@ class FlexibleScene(eqx.Module):
         return self._land(state, motion, x * length, slope / length, below, above, at_end & whole, ~certain)
 
     def _land(self, state, motion, elapsed, speed, below, above, piece_over, failed) -> FlexibleState:
-        """The state after a step, and after the event that ended it."""
+        """Return the state after a step, and after the event that ended it."""
         numbers, rocking = self.numbers, state.side != 0
         returned, fallen = rocking & below, rocking & above
-        # A locked base, whose rotation is zero to the last digit.
+        # A locked base has a rotation of exactly zero.
         still = motion.at[-1].set(jnp.where(rocking & ~returned, motion[-1], 0.0))
         stay = jnp.where(rocking, state.stay + elapsed, 0.0)
         # A column that trembles while the base uplifts must not use up the impact that ends the rocking.
@@ -240,7 +243,7 @@ class FlexibleScene(eqx.Module):
         piece = state.piece + piece_over
         stopped = piece_over & (self.knots[jnp.minimum(state.piece + 1, self.knots.size - 1)] >= self.stop)
         stopped |= piece_over & (state.piece == self.knots.size - 1)
-        # At the end of the duration: within the piece.
+        # The end of the duration may lie within the piece.
         local = jnp.where(stopped, state.local + elapsed, local)
         piece = jnp.where(stopped, state.piece, piece)
         finite = jnp.isfinite(after).all() & jnp.isfinite(elapsed)
@@ -262,17 +265,17 @@ class FlexibleScene(eqx.Module):
         )
 
     def column(self, motion: Inexact[Array, " states"]) -> Inexact[Array, " masses"]:
-        """Displacements of the masses from the base to the top, over L cos(alpha)."""
+        """Return the displacements of the masses from the base to the top, over L cos(alpha)."""
         column = unit_column(self.block.masses)
         return jnp.concatenate([jnp.zeros(1), column.shapes @ motion[: self.block.masses - 1]])
 
     @property
     def summit(self) -> Scalar:
-        """Energy of the unstable equilibrium, over m L^2 [1/s^2]."""
+        """Return the energy of the unstable equilibrium, over m L^2 [1/s^2]."""
         return self.numbers.strength * self.numbers.balance / 2
 
     def energy(self, motion: Inexact[Array, " states"]) -> tuple[Scalar, Scalar, Scalar]:
-        """Kinetic energy, strain energy of the column, potential energy of the base, over m L^2 [1/s^2]."""
+        """Return kinetic energy, strain energy of the column, potential energy of the base, over m L^2 [1/s^2]."""
         numbers = self.numbers
         q, v = jnp.split(motion[:-1], 2)
         rotation = motion[-1]
@@ -281,9 +284,9 @@ class FlexibleScene(eqx.Module):
         return jnp.sum(v**2) / 2, strain, base
 
     def conclude(self, state: FlexibleState) -> FlexibleOutcome:
-        """What came of it, from the state at the end."""
+        """Compute the outcome from the state at the end."""
         gone = state.fallen | self._never_returns(state)
-        # The stop itself: the sum of piece and local time is rounded.
+        # Take the stop itself: the sum of piece and local time is rounded.
         until = jnp.where(state.done & (state.status == Status.successful), self.stop, self.time(state))
         lost = state.fallen | (gone & (until >= self.knots[-1]))  # the ground may bring it back
         total = sum(self.energy(state.motion)) / self.summit
@@ -298,7 +301,7 @@ class FlexibleScene(eqx.Module):
         return FlexibleOutcome(rotation, displacement, bending, state.impacts, lost, margin, total, status)
 
     def _amplitudes(self, state: FlexibleState) -> Complex[Array, " modes"]:
-        """Of the modes of the rocking base [rad], about its balance."""
+        """Return the amplitudes of the modes of the rocking base [rad], about its balance."""
         return self.rocking.project @ (state.motion - state.side * self.numbers.center)
 
     def _never_returns(self, state: FlexibleState) -> Bool[Array, ""]:
@@ -311,7 +314,7 @@ class FlexibleScene(eqx.Module):
         return (side != 0) & (outward > 0) & (self.numbers.balance + outward > others)
 
     def _margin(self, state: FlexibleState, gone: Bool[Array, ""]) -> Scalar:
-        """The closeness that was, and that of the swing in which the base is, if the ground rests from now on."""
+        """Return the margin: the closeness so far, and that of the present swing if the ground rests from now on."""
         grows, decays = mirrored(self.rocking)
         outward, inward = (state.side * self._amplitudes(state).real[k] for k in (grows, decays))
         rates = (self.rocking.rates[grows].real, -self.rocking.rates[decays].real)
@@ -323,14 +326,15 @@ class FlexibleScene(eqx.Module):
 
 
 def _to_level(told: tuple[Curve, Scalar], x: Scalar) -> Scalar:
-    """How far it is to where a curve crosses a level."""
+    """Return the Newton step to where a curve crosses a level."""
     curve, level = told
     value, slope, _ = curve.jet(x)
     return (value - level) / jnp.where(slope == 0, 1.0, slope)
 
 
 def _maxima(rows, maxima, x):
-    """The largest values of rotation, displacement and bending, and of their negatives; whether they are certain."""
+    """Return the largest values of rotation, displacement and bending, and of their negatives; whether they are
+    certain."""
     both = jax.tree.map(lambda r: jnp.concatenate([r[:3], r[:3]]), rows)
     signs = jnp.array([1.0, 1, 1, -1, -1, -1])[:, None]
     both = Curve(both.amplitudes * signs, both.rates, both.coefficients * signs, both.errors)

@@ -1,6 +1,6 @@
 """Equations of motion of a rigid block: a table of coefficients, or functions of the user's own.
 
-Imports `blocks` and `numerics`. Start with `equation`, what every model must tell, then `rigid`.
+Imports `blocks` and `numerics`. Start with `equation`, the interface of every model, then `rigid`.
 """
 
 from jaxrock._surface import shown as _shown

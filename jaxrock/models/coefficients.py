@@ -1,11 +1,11 @@
 """The equation of motion as a small table of numbers, one row per model.
 
-With the opening angle x = |rotation| (rad), side s = +1 or -1, dimensionless time p t and ground
-acceleration u (g), every model of a rigid block reads
+With the opening angle x = |rotation| (rad), side s = +1 or -1, dimensionless time p t and ground acceleration u (g),
+every model of a rigid block reads
 
     x'' = -[restoring(x) + s u arm(x)],      both restoring and arm a sum  c0 + c1 x + cs sin x + cc cos x.
 
-A coefficient that a model does not have is None, so that nothing is computed for it.
+A coefficient that a model does not have is None: no code is generated for it.
 """
 
 import functools
@@ -36,7 +36,8 @@ def _or_zero(coefficient: Scalar | float | None) -> Scalar | float:
 
 
 def _length(sine: Any, cosine: Any) -> Scalar:
-    """Amplitude of a sine and a cosine together; moments over m g R neither overflow nor vanish when squared."""
+    """Return the amplitude of a sine and a cosine together. Moments over m g R neither overflow nor underflow when
+    squared."""
     return jnp.abs(sine) if cosine is None else jnp.sqrt(sum_of_products([sine, cosine], [sine, cosine]))
 
 
@@ -45,7 +46,8 @@ def _weighed(weight: Scalar | None, moment: Scalar) -> Scalar:
 
 
 class Basis(NamedTuple):
-    """What the coefficients of `Terms` multiply: 1, x, sin x and cos x at an angle, or term k of their series.
+    """The functions that the coefficients of `Terms` multiply: 1, x, sin x and cos x at an angle, or term k of their
+    series.
 
     None: zero, or not needed.
     """
@@ -57,27 +59,27 @@ class Basis(NamedTuple):
 
     @classmethod
     def at(cls, angle: Angle) -> "Basis":
-        """At an angle."""
+        """Evaluate the functions at an angle."""
         return cls(_ONE, angle.value, angle.sine, angle.cosine)
 
     @classmethod
     def of_term(cls, k: int, line: list, sine: list, cosine: list) -> "Basis":
-        """Term k of their series; sine and cosine may be shorter, where no moment has them."""
+        """Return term k of their series; sine and cosine may be shorter, where no moment has them."""
         of_sine, of_cosine = (series[k] if k < len(series) else None for series in (sine, cosine))
         return cls(_ONE if k == 0 else None, line[k], of_sine, of_cosine)
 
     def term(self, k: int) -> "Basis":
-        """Term k, of series; of those that are shorter, none."""
+        """Return term k of series; None where a series is shorter."""
         return Basis(*(None if series is None or k >= len(series) else series[k] for series in self))
 
     @property
     def derivative(self) -> "Basis":
-        """The derivatives of these functions by the angle."""
+        """Return the derivatives of these functions by the angle."""
         return Basis(None, self.constant, self.cosine, None if self.sine is None else -self.sine)
 
 
 class Terms(eqx.Module):
-    """A moment, or an arm: coefficients of 1, x, sin x and cos x; None where there is no such term."""
+    """A moment, or an arm: coefficients of 1, x, sin x and cos x; None for an absent term."""
 
     constant: Scalar | float | None = None
     line: Scalar | float | None = None
@@ -86,16 +88,16 @@ class Terms(eqx.Module):
 
     @property
     def coefficients(self) -> tuple[Scalar | float | None, ...]:
-        """In the order of `Basis`."""
+        """Return the coefficients in the order of `Basis`."""
         return self.constant, self.line, self.sine, self.cosine
 
     @property
     def trigonometric(self) -> bool:
-        """Return whether sin x or cos x appear at all."""
+        """Return whether there is a term in sin x or cos x."""
         return self.sine is not None or self.cosine is not None
 
     def summed(self, basis: Basis, empty: Any = 0.0) -> Any:
-        """The sum of coefficients times functions; `empty` where there is none."""
+        """Return the sum of coefficients times functions; `empty` where there is no such pair."""
         pairs = [(c, f) for c, f in zip(self.coefficients, basis) if c is not None and f is not None]
         alone, pairs = [c for c, f in pairs if f is _ONE], [pair for pair in pairs if pair[1] is not _ONE]
         if len(pairs) > 1:
@@ -105,18 +107,18 @@ class Terms(eqx.Module):
         return functools.reduce(operator.add, alone) if alone else empty
 
     def products(self, basis: Basis, sign: Scalar | None = None) -> list:
-        """Coefficients times functions, where there are both; `sign`: of all of them."""
+        """Return coefficients times functions, where both exist; `sign` multiplies all of them."""
         pairs = [(c, f) for c, f in zip(self.coefficients, basis) if c is not None and f is not None]
         pairs = pairs if sign is None else [(sign * c, f) for c, f in pairs]
         return [c if f is _ONE else c * f for c, f in pairs]
 
     def plus(self, other: "Terms") -> "Terms":
-        """The sum of both."""
+        """Return the sum of both."""
         pairs = zip(self.coefficients, other.coefficients)
         return Terms(*(a if b is None else b if a is None else a + b for a, b in pairs))
 
     def each(self, function: Callable, *others: Any) -> "Terms":
-        """Terms that a function makes of every coefficient there is, and of what stands in its place in `others`."""
+        """Apply a function to every coefficient that is not None, with its counterparts in `others`."""
         pairs = zip(self.coefficients, *others)
         return Terms(*(None if c is None else function(c, *more) for c, *more in pairs))
 
@@ -130,9 +132,9 @@ class Coefficients(AbstractMoments):
 
     **Arguments:**
 
-    - `restoring_terms`: a constant and a line; or a sine, with a cosine or a constant or both. What follows from the
-      moment in closed form (balance, free swings) is known for these. It is positive at x = 0;
-      where it is so again between the balance and pi/2, only `Diffrax()` solves it.
+    - `restoring_terms`: a constant and a line; or a sine, with a cosine or a constant or both. For these the balance
+      and free swings are known in closed form. The moment is positive at x = 0. Where it becomes positive again between
+      the balance and pi/2, only `Diffrax()` solves it.
     - `arm_terms`: any terms; positive at x = 0.
 
     **Raises:** ValueError for other terms of the restoring moment.
@@ -140,8 +142,8 @@ class Coefficients(AbstractMoments):
 
     restoring_terms: Terms
     arm_terms: Terms
-    known_saddle: Scalar | None = None  # where it is known beforehand: it is asked for often
-    arm_lasts: bool = eqx.field(static=True, default=False)  # whether its arm is known to be positive up to pi/2
+    known_saddle: Scalar | None = None  # a known saddle, which many functions use
+    arm_lasts: bool = eqx.field(static=True, default=False)  # whether the arm is known to be positive up to pi/2
 
     def __check_init__(self) -> None:
         moment = self.restoring_terms
@@ -154,58 +156,61 @@ class Coefficients(AbstractMoments):
 
     @property
     def bare(self) -> "Coefficients":
-        """The coefficients alone."""
+        """Return the coefficients without a known saddle."""
         return self if self.known_saddle is None else replace(self, known_saddle=None)
 
     @property
     def balanced(self) -> "Coefficients":
-        """The same, with the balance computed, once for all who ask for it."""
+        """Return the coefficients with the saddle, computed once for all its uses."""
         return replace(self, known_saddle=self.saddle)
 
     def times(self, factor: Scalar | float) -> "Coefficients":
-        """All accelerations times a factor: of a side whose own frequency parameter is not that of the scene."""
+        """Multiply all accelerations by a factor, for a side whose own frequency parameter is not that of the scene."""
         return replace(jax.tree.map(lambda c: factor * c, self.bare), known_saddle=self.saddle)
 
     @property
     def trigonometric(self) -> bool:
-        """Return whether sin x or cos x appear at all."""
+        """Return whether restoring moment or arm has a term in sin x or cos x."""
         return self.restoring_terms.trigonometric or self.arm_terms.trigonometric
 
     def restoring(self, angle: Angle) -> Scalar:
-        """Restoring moment over m g R at an opening angle."""
+        """Return the restoring moment over m g R at an opening angle."""
         return self.restoring_terms.summed(Basis.at(angle))
 
     def arm(self, angle: Angle) -> Scalar:
-        """Overturning moment over m R u g at an opening angle."""
+        """Return the overturning moment over m R u g at an opening angle."""
         return self.arm_terms.summed(Basis.at(angle))
 
     def repulsion(self, angle: Angle, push: Scalar, weight: Scalar | None = None) -> Scalar:
-        """How fast nearby angles part, per angle: minus the derivative of weight restoring + push arm."""
+        """Return the rate at which nearby angles diverge, per angle: minus the derivative of weight restoring + push
+        arm."""
         slopes = Basis.at(angle).derivative
         return -_weighed(weight, self.restoring_terms.summed(slopes)) - push * self.arm_terms.summed(slopes)
 
     def acceleration(self, angle: Angle, velocity: Scalar, push: Scalar, weight: Scalar | None = None) -> Scalar:
-        """Acceleration of the opening angle per (p t)^2; push = side u, weight = 1 + v (None: 1)."""
+        """Return the acceleration of the opening angle per (p t)^2; push = side u, weight = 1 + v (None: 1)."""
         return -(_weighed(weight, self.restoring(angle)) + push * self.arm(angle))
 
     @property
     def restoring_at_rest(self) -> Scalar:
-        """Restoring moment over m g R just after uplift: sin(alpha), or alpha in the linear model."""
+        """Return the restoring moment over m g R just after uplift: sin(alpha), or alpha in the linear model."""
         return self.restoring_terms.summed(_AT_REST)
 
     @property
     def arm_at_rest(self) -> Scalar:
-        """Overturning arm over R just after uplift: cos(alpha), or 1 in the linear model."""
+        """Return the overturning arm over R just after uplift: cos(alpha), or 1 in the linear model."""
         return self.arm_terms.summed(_AT_REST)
 
     @property
     def sinusoidal(self) -> bool:
-        """Return whether the restoring moment is a sinusoid, perhaps with a constant (else it is one straight line)."""
+        """Return whether the restoring moment is a sinusoid, possibly with a constant (else it is one straight line).
+        Return whether the restoring moment is a sinusoid, possibly with a constant (else it is one straight line)."""
         return self.restoring_terms.sine is not None
 
     @property
     def stiffness(self) -> Scalar:
-        """How fast the restoring moment falls at the saddle: k in k sin(saddle - x), or k (saddle - x)."""
+        """Return the rate at which the restoring moment falls at the saddle: k in k sin(saddle - x), or k (saddle - x).
+        Return the rate at which the restoring moment falls at the saddle: k in k sin(saddle - x), or k (saddle - x)."""
         moment = self.restoring_terms
         if not self.sinusoidal:
             return jnp.asarray(-_or_zero(moment.line))
@@ -214,19 +219,20 @@ class Coefficients(AbstractMoments):
 
     @property
     def steepest(self) -> Scalar:
-        """Bound of how fast the restoring moment changes with the angle."""
+        """Return a bound of the rate at which the restoring moment changes with the angle."""
         moment = self.restoring_terms
         return _length(moment.sine, moment.cosine) if self.sinusoidal else jnp.abs(_or_zero(moment.line))
 
     @property
     def skew(self) -> Scalar | None:
-        """c in restoring(x) = k [sin(saddle - x) + c (1 - cos(saddle - x))]; None where there is no such part."""
+        """Return c in restoring(x) = k [sin(saddle - x) + c (1 - cos(saddle - x))]; None for a moment without that
+        part."""
         constant = self.restoring_terms.constant
         return constant / self.stiffness if self.sinusoidal and constant is not None else None
 
     @property
     def saddle(self) -> Scalar:
-        """Opening angle of the unstable equilibrium: the block balances on its corner [rad]."""
+        """Return the opening angle of the unstable equilibrium, in which the block balances on its corner [rad]."""
         moment = self.restoring_terms
         if self.known_saddle is not None:
             return self.known_saddle
@@ -236,34 +242,37 @@ class Coefficients(AbstractMoments):
         return middle if moment.constant is None else middle + jnp.arctan2(moment.constant, self.stiffness)
 
     def manifold(self, x: Scalar) -> Scalar:
-        """Outward velocity over p that just reaches the saddle without forcing [rad]; negative beyond it."""
+        """Return the outward velocity over p that just reaches the saddle without forcing [rad]; negative beyond it."""
         gap = self.saddle - x
         if self.skew is not None:
             return jnp.sqrt(self.stiffness) * free_swing.distance(gap, self.skew)
-        # In half the angle: no cancellation near the saddle.
+        # Half the angle avoids cancellation near the saddle.
         distance = 2 * sine_cosine(gap / 2)[0] if self.sinusoidal else gap
         return jnp.sqrt(self.stiffness) * distance
 
     @property
     def _arm_may_turn(self) -> bool:
-        """Return whether the arm may change its sign or grow before pi/2, by its form."""
+        """Return whether an arm of this form may change its sign or grow before pi/2."""
         arm = self.arm_terms
         several = arm.constant is not None and arm.cosine is not None
         return not self.arm_lasts and (arm.line is not None or arm.sine is not None or several)
 
     @property
     def _may_right_again(self) -> bool:
-        """Return whether the restoring moment may rise again before pi/2, by its form."""
+        """Return whether a restoring moment of this form may rise again before pi/2."""
         return self.restoring_terms.constant is not None and self.restoring_terms.cosine is not None
 
     def held(self, angle: Angle, velocity: Scalar, push: Scalar, weight: Scalar | None = None) -> Scalar:
-        """As for any moments."""
+        """Return the largest inward acceleration under a forcing of at most this size [g]."""
         held = self.held_either_way if self._arm_may_turn else super().held
         return held(angle, velocity, push, weight)
 
     def held_manifold(self, angle: Angle, hold: Scalar, push: Scalar, weight: Scalar | None = None) -> Scalar:
-        """As for any moments. For a spring with a line or a constant it is more than enough: what holds stays below a
-        line from `hold` to zero. Infinite for an arm, or a restoring moment, of which that is not known."""
+        """Return an outward velocity over p that reaches the unstable equilibrium under a constant forcing.
+
+        For a spring with a line or a constant it is an upper bound: the holding moment stays below a line from `hold`
+        to zero. It is infinite for an arm, or a restoring moment, without a known bound.
+        """
         arm = self.arm_terms
         if arm.line is not None:
             return jnp.full_like(hold, jnp.inf)
@@ -272,12 +281,12 @@ class Coefficients(AbstractMoments):
         # An arm without a line has at most one zero up to pi/2.
         here, flat = self.arm(angle), arm.summed(Basis.at(_FLAT))
         lasts = here * flat > 0
-        if arm.constant is not None and arm.cosine is not None:  # concave, so that its tangent is above it
+        if arm.constant is not None and arm.cosine is not None:  # concave, so its tangent is above it
             lasts = lasts & (arm.constant >= 0) & (arm.cosine >= 0)
         return where(lasts, self._enough(angle, hold, push * jnp.sign(here), weight), jnp.inf)
 
     def _enough(self, angle: Angle, hold: Scalar, push: Scalar, weight: Scalar | None) -> Scalar:
-        """`held_manifold` by an arm that keeps its sign, which is that of `push`."""
+        """Compute `held_manifold` for an arm that keeps its sign, which `push` includes."""
         moment, arm, factor = self.restoring_terms, self.arm_terms, 1.0 if weight is None else weight
         if self.sinusoidal and self.skew is None and arm.constant is None:
             sines, cosines = (
@@ -287,28 +296,30 @@ class Coefficients(AbstractMoments):
             return jnp.sqrt(2 * jnp.maximum(_length(sines, cosines) - self.repulsion(angle, push, weight), 0.0))
         if arm.sine is not None:
             return jnp.full_like(hold, jnp.inf)
-        if not self.sinusoidal:  # its sum with an arm that is a constant, or a cosine, is concave: the tangent
+        if not self.sinusoidal:  # The sum with a constant or cosine arm is concave: below its tangent.
             slope = self.repulsion(angle, push, weight)
-        else:  # convex up to pi/2, so that it is below its chord; the arm, a cosine, is concave
+        else:  # convex up to pi/2, so below its chord; the arm, a cosine, is concave
             fall = self.restoring(angle) - self.restoring(_FLAT)
             slope = factor * fall / jnp.maximum(jnp.pi / 2 - angle.value, jnp.finfo(hold.dtype).eps)
-            if self._may_right_again:  # concave at first where the constant is negative: below its tangent or its chord
+            if self._may_right_again:  # concave at first if the constant is negative: below tangent or chord
                 slope = jnp.minimum(slope, -factor * moment.summed(Basis.at(angle).derivative))
             slope = slope + push * _or_zero(arm.cosine) * angle.sine
-        # Without weight the forcing alone brings it back.
+        # Without weight, the forcing alone brings the block back.
         light = jnp.zeros_like(slope, bool) if weight is None else weight <= 0
-        if self._may_right_again:  # and it rights itself again where its moment does not fall any more at pi/2
+        if self._may_right_again:  # also where its moment no longer falls at pi/2: it rights itself again
             light = light | (jnp.asarray(moment.cosine) <= 0)
         return where(light, jnp.inf, hold / jnp.sqrt(where(light, 1.0, slope)))
 
     def unheld_manifold(self, angle: Angle, hold: Scalar, push: Scalar, weight: Scalar | None = None) -> Scalar | float:
-        """As for any moments; infinite, too, where bounds of moment and arm further on do not exclude that they hold
-        it."""
+        """Return zero where no moment further on can hold the block.
+
+        It is infinite, too, where bounds of moment and arm further on do not exclude that they hold it.
+        """
         if not self._arm_may_turn and not self._may_right_again:
             return 0.0
         arm, flat = self.arm_terms, self.restoring(_FLAT)
         most = jnp.abs(_or_zero(arm.constant)) + jnp.abs(_or_zero(arm.line)) * jnp.pi / 2
         most = push * (most + _length(_or_zero(arm.sine), arm.cosine))
-        # The restoring moment falls, or rises again: it is largest at an end. Beyond pi/2 nothing is taken to hold it.
+        # The restoring moment falls, or rises again: it is largest at an end. Beyond pi/2 no moment counts as holding.
         may = (flat > 0) | (_weighed(weight, jnp.maximum(self.restoring(angle), flat)) + most > 0)
         return where(may & (angle.value < jnp.pi / 2), jnp.inf, 0.0)

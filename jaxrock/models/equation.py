@@ -1,7 +1,7 @@
-"""What every model must tell: for a block on one of its corners, the moments that act on it.
+"""The interface of every model: the moments that act on a block on one of its corners.
 
 With the opening angle x = |rotation| (rad), velocity v = dx/d(p t), side s and ground acceleration u (g), x'' is minus
-the restoring moment and s u times the overturning arm, both over m g R, and whatever else a model adds.
+the restoring moment and s u times the overturning arm, both over m g R, and any further terms of a model.
 """
 
 import abc
@@ -34,22 +34,22 @@ class Angle(NamedTuple):
 
     @classmethod
     def of(cls, value: Scalar | float) -> "Angle":
-        """An angle from its value, between 0 and pi/2 or a little beyond."""
+        """Build an angle from its value, between 0 and pi/2 or a little beyond."""
         return cls(value, *sine_cosine(jnp.asarray(value)))
 
 
 class Rolled(NamedTuple):
-    """Where the centre of mass is over the point at which a block touches the ground, all over R."""
+    """Position of the centre of mass relative to the contact of a block with the ground, all over R."""
 
     height: Scalar
-    reach: Scalar  # horizontal distance; positive as long as the weight rights the block
-    radius: Scalar  # of curvature of what it rolls on
+    reach: Scalar  # horizontal distance; positive as long as the weight restores the block
+    radius: Scalar  # radius of curvature of the edge at the contact
 
 
 class AbstractMoments(eqx.Module):
-    """The moments that act on one block on one of its corners, and what follows from them."""
+    """The moments that act on one block on one of its corners, and quantities derived from these."""
 
-    if TYPE_CHECKING:  # which would make them arguments of every subclass, where they are mostly properties
+    if TYPE_CHECKING:  # annotations here would make them arguments of every subclass, where most are properties
 
         @property
         def saddle(self) -> Scalar: ...
@@ -61,54 +61,58 @@ class AbstractMoments(eqx.Module):
         def arm_at_rest(self) -> Scalar: ...
     else:
         saddle: eqx.AbstractVar[Scalar]  # opening angle of the unstable equilibrium: it balances on its corner [rad]
-        stiffness: eqx.AbstractVar[Scalar]  # how fast the restoring moment falls there; 1 where that is not known
+        stiffness: eqx.AbstractVar[Scalar]  # rate at which the restoring moment falls there; 1 if unknown
         restoring_at_rest: eqx.AbstractVar[Scalar]  # restoring moment just after uplift, positive
         arm_at_rest: eqx.AbstractVar[Scalar]  # overturning arm just after uplift, positive
 
     @abc.abstractmethod
     def acceleration(self, angle: Angle, velocity: Scalar, push: Scalar, weight: Scalar | None = None) -> Scalar:
-        """Acceleration of the opening angle per (p t)^2; push = side u, weight = 1 + v (None: 1)."""
+        """Return the acceleration of the opening angle per (p t)^2; push = side u, weight = 1 + v (None: 1)."""
 
     @abc.abstractmethod
     def restoring(self, angle: Angle) -> Scalar:
-        """Restoring moment over m g R at an opening angle."""
+        """Return the restoring moment over m g R at an opening angle."""
 
     @abc.abstractmethod
     def arm(self, angle: Angle) -> Scalar:
-        """Overturning moment over m R u g at an opening angle."""
+        """Return the overturning moment over m R u g at an opening angle."""
 
     @abc.abstractmethod
     def repulsion(self, angle: Angle, push: Scalar, weight: Scalar | None = None) -> Scalar:
-        """How fast nearby angles part, per angle: the derivative of the acceleration by the angle."""
+        """Return the rate at which nearby angles diverge, per angle: the derivative of the acceleration by the angle.
+        Return the rate at which nearby angles diverge, per angle: the derivative of the acceleration by the angle."""
 
     @abc.abstractmethod
     def times(self, factor: Scalar | float) -> "AbstractMoments":
-        """All accelerations times a factor: of a side whose own frequency parameter is not that of the scene."""
+        """Multiply all accelerations by a factor, for a side whose own frequency parameter is not that of the scene."""
 
     @abc.abstractmethod
     def held_manifold(self, angle: Angle, hold: Scalar, push: Scalar, weight: Scalar | None = None) -> Scalar:
-        """Outward velocity over p that is enough to reach the unstable equilibrium under a constant forcing.
+        """Return an outward velocity over p that reaches the unstable equilibrium under a constant forcing.
 
         `push`: the forcing against it [g]; `weight`: 1 + vertical acceleration (None: 1); `hold`: restoring moment and
         forcing at the angle, positive.
         """
 
     def unheld_manifold(self, angle: Angle, hold: Scalar, push: Scalar, weight: Scalar | None = None) -> Scalar | float:
-        """The same where `hold` is not positive: zero, unless something further on may hold it."""
+        """Return `held_manifold` for a `hold` that is not positive: zero, unless a moment further on may hold the
+        block."""
         return 0.0
 
     def held(self, angle: Angle, velocity: Scalar, push: Scalar, weight: Scalar | None = None) -> Scalar:
-        """The largest acceleration inward under a forcing of this size or less [g]."""
+        """Return the largest inward acceleration under a forcing of at most this size [g]."""
         return -self.acceleration(angle, velocity, push, weight)
 
     def held_either_way(self, angle: Angle, velocity: Scalar, push: Scalar, weight: Scalar | None = None) -> Scalar:
-        """The same where the arm may be negative."""
+        """Return `held` for an arm that may be negative."""
         one, other = (-self.acceleration(angle, velocity, way * push, weight) for way in (1, -1))
         return jnp.maximum(one, other)
 
     def work(self, opening: Scalar) -> Scalar:
-        """Work of the weight up to an opening angle, over m g R: half the squared speed on the ground after a free fall
-        from there."""
+        """Return the work of the weight up to an opening angle, over m g R.
+
+        It is half the squared speed on the ground after a free fall from there.
+        """
         nodes, weights = (jnp.asarray(values, opening.dtype) for values in _GAUSS)
         return opening * jnp.sum(weights * jax.vmap(lambda x: self.restoring(Angle.of(x)))(opening * nodes))
 
@@ -121,33 +125,37 @@ class AbstractMoments(eqx.Module):
         """Return smooth moments that act from an opening angle on, outward or inward, and the next angle at which they
         bend.
 
-        The moments go on beyond that angle as if they did not bend. The angle is beyond pi/2 where there is none.
+        The moments continue smoothly past that angle. Without a further bend the angle is beyond pi/2.
         """
         raise NotImplementedError
 
     def rolled(self, angle: Angle) -> Rolled | None:
-        """Where the centre of mass is at an opening angle; None for a block that turns about its corner."""
+        """Return the position of the centre of mass at an opening angle; None for a block that turns about its corner.
+        Return the position of the centre of mass at an opening angle; None for a block that turns about its corner."""
         return None
 
     @property
     def threshold(self) -> Scalar:
-        """Ground acceleration at which the block uplifts [g]: tan(alpha), or alpha in the linear model."""
+        """Return the ground acceleration at which the block uplifts [g]: tan(alpha), or alpha in the linear model."""
         return self.restoring_at_rest / self.arm_at_rest
 
     def change_at_rest(self, horizontal: Scalar, vertical: Scalar | None) -> Scalar:
-        """By how much the acceleration just after uplift changes with that of the ground, at most."""
+        """Bound the change of the acceleration just after uplift by the changes of the ground acceleration."""
         change = horizontal * self.arm_at_rest
         return change if vertical is None else change + vertical * self.restoring_at_rest
 
 
 class AbstractEquation(Owner):
-    """An equation of motion of rigid blocks. Models of the package are such, and a model of your own may be.
+    """An equation of motion of rigid blocks: the base class of the package's models, and of your own.
 
-    A subclass says in `moments` what acts on a block: `Coefficients`, where restoring moment and arm are sums of a
-    constant, a line, a sine and a cosine of the opening angle (then the series engine solves it, exact to rounding, and
-    in machine code), or the moments of an `Equation` made of functions (then the diffrax engine does, and `is_series`
-    is false). Its fields are parameters: what is an array there may be differentiated by, and may differ from lane to
-    lane under `jax.vmap`.
+    A subclass returns from `moments` the moments that act on a block:
+
+    - `Coefficients`, where restoring moment and arm are sums of a constant, a line, a sine and a cosine of the opening
+      angle. The series engine solves it, exact to rounding, and in machine code.
+    - The moments of an `Equation` made of functions. The diffrax engine solves it, and `is_series` is false.
+
+    Its fields are parameters. Arrays among them may be differentiated by, and may differ from lane to lane under
+    `jax.vmap`.
     """
 
     def __check_init__(self):
@@ -155,23 +163,23 @@ class AbstractEquation(Owner):
 
     @abc.abstractmethod
     def moments(self, block: Block | Side) -> AbstractMoments:
-        """The moments that act on a block, or on one side of an asymmetric one.
+        """Return the moments that act on a block, or on one side of an asymmetric one.
 
         **Arguments:**
 
-        - `block`: tells `alpha` [rad] and `p` [rad/s], scalars.
+        - `block`: has `alpha` [rad] and `p` [rad/s], scalars.
 
         **Returns:** moments over m g R, in time p t.
         """
 
     def moments_of_sides(self, block: AsymmetricBlock) -> tuple[AbstractMoments, AbstractMoments]:
-        """Those of side 1 and of side 2 of an asymmetric block; each in its own time."""
+        """Return the moments of side 1 and of side 2 of an asymmetric block, each in its own time."""
         first, second = block.sides
         return self.moments(first), self.moments(second)
 
     @property
     def falls_flat(self) -> bool:
-        """Return whether a rotation of pi/2 means that the block lies on its side."""
+        """Return whether a block at a rotation of pi/2 lies on its side."""
         return True
 
     @property
@@ -186,8 +194,11 @@ class AbstractEquation(Owner):
 
 
 def last_rise(moments: AbstractMoments, like: Scalar) -> Scalar:
-    """The opening angle from which on up to pi/2 the restoring moment over the arm only falls, by a scan, without
-    derivatives: what does not hold a block there will not hold it further on. `like`: a number of the same type."""
+    """Return the opening angle from which the ratio of restoring moment to arm only falls, up to pi/2.
+
+    A forcing that does not hold a block there will not hold it further on. The angle comes from a scan, without
+    derivatives. `like`: a number of the same dtype.
+    """
     grid = _grid(like)
 
     def strength(x):
@@ -203,8 +214,10 @@ def _grid(like: Scalar) -> Inexact[Array, " angles"]:
 
 
 def first_zero(moment: Callable, like: Scalar) -> Scalar:
-    """Where a moment that rights a block first vanishes, at most pi/2: a scan, bisection, and the derivatives of the
-    implicit function. `like`: a number of the same type."""
+    """Return the first zero of a restoring moment, at most pi/2.
+
+    A scan and bisection find it; the implicit function gives its derivatives. `like`: a number of the same dtype.
+    """
     grid = _grid(like)
     falls = jax.lax.stop_gradient(jax.vmap(moment)(grid)) <= 0
     first = jnp.argmax(falls)

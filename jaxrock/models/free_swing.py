@@ -1,8 +1,10 @@
 """Free swings about a balance where the restoring moment is a sinusoid and a constant (spring models, law "plastic").
 
-Over its slope there, the moment at an angle `gap` short of the balance is sin(gap) + skew (1 - cos(gap)); time is in
-units in which this slope is one. Below the energy of the balance the block turns back at the gap g0, and with
-gap = g0 cosh(phi) its time is the integral of a smooth function of phi; above it gap = kappa sinh(phi) does the same.
+Over its slope there, the moment at an angle `gap` short of the balance is sin(gap) + skew (1 - cos(gap)). Time is in
+units in which this slope is one.
+
+Below the energy of the balance the block turns back at the gap g0. With gap = g0 cosh(phi) its time is the integral of
+a smooth function of phi. Above that energy gap = kappa sinh(phi) does the same.
 """
 
 from collections.abc import Callable
@@ -17,27 +19,28 @@ from jaxrock.numerics.roots import bracketed_root
 
 Scalar = Inexact[Array, ""]
 
-# As many as leave an error below that of rounding in the energy: with 24, 1e-15 up to lengths of 10 (a turn 1e-4 from
-# the balance), and 1e-11 at 35, where rounding decides whether it turns at all.
+# With 24 nodes the error stays below rounding of the energy. It is 1e-15 up to lengths of 10 (a turn 1e-4 from the
+# balance), and 1e-11 at 35, where rounding decides whether the block turns.
 _NODES, _WEIGHTS = gauss_legendre_of_unit(24)
 
 
 def moment(gap: Scalar, skew: Scalar) -> Scalar:
-    """Restoring moment over its slope at the balance."""
+    """Return the restoring moment over its slope at the balance."""
     half, cosine = sine_cosine(gap / 2)
     return 2 * half * (cosine + skew * half)
 
 
 def distance(gap: Scalar, skew: Scalar) -> Scalar:
-    """Speed that just reaches the balance, with the sign of the gap: the root of twice the work up to there."""
-    # 4 sin^2(gap/2) + 2 skew (gap - sin(gap)), without cancellation.
+    """Return the speed that just reaches the balance, with the sign of the gap: the root of twice the work up to there.
+    Return the speed that just reaches the balance, with the sign of the gap: the root of twice the work up to there."""
+    # The root of 4 sin^2(gap/2) + 2 skew (gap - sin(gap)), without cancellation.
     return gap * jnp.sqrt(sine_ratio(gap / 2) ** 2 + 2 * skew * gap * sine_lag(gap))
 
 
 def turning_gap(deficit: Scalar, skew: Scalar, reach: Scalar) -> Scalar:
-    """Gap at which a block turns back, at most `reach`; `deficit`: twice the energy that it lacks to the balance.
+    """Return the gap at which a block turns back, at most `reach`; `deficit`: twice the energy missing to the balance.
 
-    Beyond the balance the same holds with the negative skew.
+    Beyond the balance, the negative skew gives the gap.
     """
     missing = jnp.sqrt(jnp.maximum(deficit, least(deficit)))
     return bracketed_root(_lacking, jnp.zeros_like(missing), reach, missing, skew)
@@ -48,10 +51,10 @@ def _lacking(gap: Inexact[Array, ""], missing: Inexact[Array, ""], skew: Inexact
 
 
 def time_to_turning(gap: Scalar, speed: Scalar, turn: Scalar, skew: Scalar) -> Scalar:
-    """Time from a gap, at this speed, to the turning point at the gap `turn`."""
+    """Return the time from a gap, at this speed, to the turning point at the gap `turn`."""
 
     def rate2(off):
-        """Squared speed over gap^2 - turn^2, at the gap turn + 2 off."""
+        """Return the squared speed over gap^2 - turn^2, at the gap turn + 2 off."""
         mean = turn + off
         half, lag = sine_ratio(mean / 2), off**2 * sine_lag(off)
         rest = 1 - lag  # sin(off)/off
@@ -63,7 +66,7 @@ def time_to_turning(gap: Scalar, speed: Scalar, turn: Scalar, skew: Scalar) -> S
 
 
 def time_from_balance(gap: Scalar, excess: Scalar, skew: Scalar) -> Scalar:
-    """Time from the balance to a gap, negative before it; `excess`: squared speed at the balance."""
+    """Return the time from the balance to a gap, negative before it; `excess`: squared speed at the balance."""
     kappa = jnp.sqrt(jnp.maximum(excess, least(excess)))
 
     def of(up, down):
@@ -74,7 +77,7 @@ def time_from_balance(gap: Scalar, excess: Scalar, skew: Scalar) -> Scalar:
 
 
 def _integral(function: Callable, length: Scalar) -> Scalar:
-    """Gauss-Legendre quadrature over phi from 0 to a length, of a function of exp(phi) and exp(-phi)."""
+    """Integrate a function of exp(phi) and exp(-phi) over phi from 0 to a length, by Gauss-Legendre quadrature."""
     nodes, weights = (jnp.asarray(values, length.dtype) for values in (_NODES, _WEIGHTS))
 
     def add(k, total):
@@ -85,5 +88,5 @@ def _integral(function: Callable, length: Scalar) -> Scalar:
 
 
 def least(like: Scalar) -> float:
-    """Of a squared speed: its root has a derivative, and a square."""
+    """Return the smallest squared speed whose root has a derivative and a square."""
     return 4 * float(jnp.finfo(like.dtype).tiny)

@@ -12,8 +12,9 @@ class Housner(AbstractEquation):
     """The rigid rectangular block with its exact nonlinear equation (Housner 1963; D&D 2012, 2.1-2.2)."""
 
     def moments(self, block: Block | Side) -> Coefficients:
-        """sin(alpha - x) = sin(alpha) cos x - cos(alpha) sin x; its arm is cos(alpha - x)."""
-        sine, cosine = sine_cosine(block.alpha)  # a quotient of XLA's own becomes a tangent, which LLVM may lack
+        """Return the restoring moment sin(alpha - x) = sin(alpha) cos x - cos(alpha) sin x, with the arm cos(alpha -
+        x)."""
+        sine, cosine = sine_cosine(block.alpha)  # XLA turns sin/cos quotients into a tangent, which LLVM may lack
         return Coefficients(Terms(sine=-cosine, cosine=sine), Terms(sine=sine, cosine=cosine), arm_lasts=True)
 
 
@@ -21,11 +22,11 @@ class Linear(AbstractEquation):
     """The slender block linearised about its corner (D&D 2012, 3.1-3.2; Voyagaki et al. 2012, 2.3)."""
 
     def moments(self, block: Block | Side) -> Coefficients:
-        """Restoring moment alpha - x, arm 1."""
+        """Return the restoring moment alpha - x, with arm 1."""
         one = jnp.ones_like(block.alpha)
         return Coefficients(Terms(constant=block.alpha, line=-one), Terms(constant=one))
 
     @property
     def falls_flat(self) -> bool:
-        """A linear block has no horizontal: only the point of no return counts."""
+        """Return False: a linear block has no horizontal position, only the point of no return counts."""
         return False

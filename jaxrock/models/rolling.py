@@ -1,4 +1,4 @@
-"""The block whose edges are rounded: it rolls on them, and does not turn about a corner."""
+"""The block with rounded edges: it rolls on them instead of turning about a corner."""
 
 from dataclasses import replace
 
@@ -23,30 +23,31 @@ Scalar = Inexact[Array, ""]
 class Rolling(AbstractEquation):
     """A rigid block that rolls without slipping on rounded edges; the diffrax engine solves it.
 
-    At rest it stands on the ground between two corners, where the rounding begins; to these belong the `alpha` and `p`
-    of a block, and its restitution: the impact comes when the flat part meets the ground, and changes the angular
-    velocity as it does of a block with sharp corners there. With the height H of the centre of mass over the ground at
-    an opening angle x, over R, its horizontal distance H' from the point of contact, and the radius of curvature r
-    there, H'' = r - H and
+    At rest it stands on the ground between two corners, where the rounding begins. The `alpha` and `p` of a block
+    belong to these corners, and so does its restitution. The impact comes when the flat part meets the ground; it
+    changes the angular velocity as for a block with sharp corners there.
+
+    At an opening angle x, H is the height of the centre of mass over the ground, over R. H' is its horizontal distance
+    from the point of contact, and r the radius of curvature there. Then H'' = r - H and
 
         [1 + k (H^2 + H'^2 - 1)] x'' + k r H' x'^2 = -[(1 + v) H' + s u H],
 
-    k the inertia ratio m R^2/I. On a circle of radius r over a rectangle H = r + (cos(alpha) - r) cos(x) +
-    sin(alpha) sin(x). It uplifts where a block with sharp corners does, and balances later: at
+    k the inertia ratio m R^2/I. On a circle of radius r over a rectangle H = r + (cos(alpha) - r) cos(x) + sin(alpha)
+    sin(x). The block uplifts where a block with sharp corners does, and balances later: at
     arctan(sin(alpha)/(cos(alpha) - r)).
 
     **Arguments:**
 
     - `edge`: radius over R [-], 0 or more, of the circle that is the edge; or an `Edge`, which may be rounded
       otherwise.
-    - `other`: the same of side 2 of an `AsymmetricBlock`, over R2. None: as `edge`.
+    - `other`: the edge of side 2 of an `AsymmetricBlock`, over R2. None: as `edge`.
     - `inertia_ratio`: of a symmetric `Block`: m R^2/I about a corner [-], in (0, 1]; 3/4 for a rectangle. An
       `AsymmetricBlock` has its own.
 
     Where the radius is so large that the block does not balance before pi/2, it overturns only by lying flat. A
     facetted base, which loses energy at every facet, is not such an edge.
 
-    **Raises:** ValueError for values outside their ranges; for a symmetric block whose `other` edge was given.
+    **Raises:** ValueError for values outside their ranges; for a symmetric block with an `other` edge.
 
     **Source:** derived here, as Lagrange's equation of rolling without slipping.
     """
@@ -67,19 +68,19 @@ class Rolling(AbstractEquation):
         self.edge, self.other = (edge, None) if other is None else _alike(edge, other)
 
     def moments(self, block: Block | Side) -> "RollingMoments":
-        """What acts on a symmetric block."""
+        """Return the moments of a symmetric block."""
         if self.other is not None:
             raise ValueError("Argument `other` must be None for a symmetric block, whose edges are alike.")
         return RollingMoments.of(block.alpha, self.inertia_ratio, self.edge)
 
     def moments_of_sides(self, block: AsymmetricBlock) -> tuple["RollingMoments", "RollingMoments"]:
-        """What acts on both sides of an asymmetric one."""
+        """Return the moments of both sides of an asymmetric block."""
         first = RollingMoments.of(block.alpha1, block.inertia_ratio, self.edge)
         return first, RollingMoments.of(block.alpha2, block.inertia_ratio2, self.other or self.edge)
 
     @property
     def is_series(self) -> bool:
-        """The moment of inertia about the point of contact changes."""
+        """Return False: the moment of inertia about the point of contact changes."""
         return False
 
 
@@ -89,19 +90,19 @@ class RollingMoments(AbstractMoments):
     slenderness: Angle
     ratio: Scalar
     pieces: EdgePieces
-    factor: Scalar  # of all accelerations (see `times`)
+    factor: Scalar  # multiplies all accelerations (see `times`)
     saddle: Scalar
-    firm: Scalar | None = None  # up to where it may right itself again (`last_rise`); None: nowhere, on a circle
+    firm: Scalar | None = None  # angle past which the block gets no firmer (`last_rise`); None: a circle
 
     @classmethod
     def of(cls, alpha: Scalar, ratio: Scalar, edge: Edge) -> "RollingMoments":
-        """Of a block, or a side."""
+        """Compute the moments of a block, or of a side."""
         made = cls(Angle.of(alpha), ratio, edge.pieces(), jnp.ones_like(alpha), alpha)
         firm = None if edge.angle is None else _firm(made)
         return replace(made, saddle=_balance(made), firm=firm)
 
     def times(self, factor: Scalar | float) -> "RollingMoments":
-        """As for any moments."""
+        """Multiply all accelerations by a factor."""
         return replace(self, factor=factor * self.factor)
 
     @property
@@ -115,7 +116,7 @@ class RollingMoments(AbstractMoments):
         return replace(self, pieces=piece), angle
 
     def rolled(self, angle: Angle) -> Rolled:
-        """Where the centre of mass is over the point of contact."""
+        """Return the position of the centre of mass over the point of contact."""
         sine, cosine = self.slenderness.sine, self.slenderness.cosine
         added = self.pieces.at(angle.value)
         return Rolled(
@@ -125,66 +126,67 @@ class RollingMoments(AbstractMoments):
         )
 
     def _inertia(self, at: Rolled) -> Scalar:
-        """About the point of contact, over that at rest."""
+        """Return the moment of inertia about the point of contact, over that at rest."""
         return 1 + self.ratio * (at.height**2 + at.reach**2 - 1)
 
     def acceleration(self, angle: Angle, velocity: Scalar, push: Scalar, weight: Scalar | None = None) -> Scalar:
         """Acceleration of the opening angle per (p t)^2; push = side u, weight = 1 + v (None: 1)."""
         at = self.rolled(angle)
         moment = self.factor * ((at.reach if weight is None else weight * at.reach) + push * at.height)
-        # The moment of inertia grows as it rolls on; that does not depend on the unit of time.
+        # The change of inertia as the block rolls is geometric: `factor`, the unit of time, does not multiply it.
         return -(moment + self.ratio * at.radius * at.reach * velocity**2) / self._inertia(at)
 
     def restoring(self, angle: Angle) -> Scalar:
-        """Restoring moment over m g R at an opening angle, of a moment of inertia as at rest."""
+        """Return the restoring moment over m g R at an opening angle, with the moment of inertia at rest."""
         at = self.rolled(angle)
         return self.factor * at.reach / self._inertia(at)
 
     def arm(self, angle: Angle) -> Scalar:
-        """Overturning moment over m R u g at an opening angle, of a moment of inertia as at rest."""
+        """Return the overturning moment over m R u g at an opening angle, with the moment of inertia at rest."""
         at = self.rolled(angle)
         return self.factor * at.height / self._inertia(at)
 
     def repulsion(self, angle: Angle, push: Scalar, weight: Scalar | None = None) -> Scalar:
-        """How fast nearby angles part, per angle, of a block that stands still."""
+        """Return the rate at which nearby angles of a block that stands still diverge, per angle."""
         still = jnp.zeros_like(angle.value)
         return jax.grad(lambda x: self.acceleration(Angle.of(x), still, push, weight))(angle.value)
 
     def work(self, opening: Scalar) -> Scalar:
-        """By how much the centre of mass rises: the moment of inertia there does not matter."""
+        """Return the rise of the centre of mass: the moment of inertia there does not matter."""
         half, (_, sine, cosine) = Angle.of(opening / 2), self.slenderness
         over_a_corner = 2 * half.sine * (sine * half.cosine - cosine * half.sine)  # cos(alpha - x) - cos(alpha)
         return self.factor * (over_a_corner + self.pieces.at(opening).rise)
 
     @property
     def restoring_at_rest(self) -> Scalar:
-        """As of a sharp corner."""
+        """Return the value for a sharp corner."""
         return self.factor * self.slenderness.sine
 
     @property
     def arm_at_rest(self) -> Scalar:
-        """As of a sharp corner."""
+        """Return the value for a sharp corner."""
         return self.factor * self.slenderness.cosine
 
     @property
     def stiffness(self) -> Scalar:
-        """How fast the restoring moment falls where it balances; the factor where it does not before pi/2."""
+        """Return the rate at which the restoring moment falls at the balance; the factor where no balance lies before
+        pi/2."""
         at = self.rolled(Angle(self.saddle, *sine_cosine(self.saddle)))
         falls = at.height - at.radius
         return jnp.where(falls > 0, self.factor * falls / self._inertia(at), self.factor)
 
     def held_manifold(self, angle: Angle, hold: Scalar, push: Scalar, weight: Scalar | None = None) -> Scalar:
-        """As for any moments; infinite, because it may roll on to a firmer part."""
+        """Return infinity: the block may roll on to a part that holds it better."""
         return jnp.full_like(hold, jnp.inf)
 
     def unheld_manifold(self, angle: Angle, hold: Scalar, push: Scalar, weight: Scalar | None = None) -> Scalar | float:
-        """As for any moments; on a circle nothing is firmer further on."""
+        """Return zero beyond `firm`: there no part holds the block better further on, as on a circle."""
         return 0.0 if self.firm is None else jnp.where(angle.value < self.firm, jnp.inf, 0.0)
 
 
 @one_program
 def _balance(moments: RollingMoments) -> Scalar:
-    """The opening angle at which the centre of mass is over the point of contact, at most pi/2."""
+    """Return the opening angle at which the centre of mass is over the point of contact, at most pi/2."""
     return first_zero(lambda x: moments.rolled(Angle.of(x)).reach, moments.saddle)
 
 
@@ -194,7 +196,7 @@ def _firm(moments: RollingMoments) -> Scalar:
 
 
 def _alike(first: Edge, second: Edge) -> tuple[Edge, Edge]:
-    """Two edges of as many angles, so that one program serves both sides."""
+    """Pad two edges to the same number of angles, so that one program serves both sides."""
     if first.angle is None and second.angle is None:
         return first, second
     known = [jnp.zeros(1) if edge.angle is None else edge.angle for edge in (first, second)]

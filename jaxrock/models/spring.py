@@ -20,15 +20,17 @@ class Spring(AbstractEquation):
       or `"SM3"` (the mass at the height R cos(alpha) above the spring), all with the block's moment of inertia; or
       `"mmSM"` (a rigid column of length 2R that carries many masses).
     - `law`: moment of the spring over m g R at the opening angle x: `"sine"`: sin(alpha - x), the block's own;
-      `"linear"`: sin(alpha) (1 - x/alpha), a constant negative stiffness; `"plastic"`: sin(alpha), and the weight
-      of the leaning column pulls by sin(x) (SM1, mmSM) or cos(alpha) sin(x) (SM2, SM3).
-    - `masses`: of mmSM: how many, 2 or more, at equal distances from the base to the top; each carries the part of the
-      column next to it, those at the ends half as much. Their mean height is R, and their moment of inertia
-      1 + 1/(2 (masses - 1)^2) times the block's. None: a mass that is spread along the column, as printed.
+      `"linear"`: sin(alpha) (1 - x/alpha), a constant negative stiffness; `"plastic"`: sin(alpha), and the weight of
+      the leaning column pulls by sin(x) (SM1, mmSM) or cos(alpha) sin(x) (SM2, SM3).
+    - `masses`: of mmSM: their number, 2 or more, at equal distances from the base to the top. Each carries the part of
+      the column next to it, those at the ends half as much. Their mean height is R, and their moment of inertia 1 +
+      1/(2 (masses
+    - 1)^2) times the block's. None: a mass that is spread along the column, as printed.
 
     All have the overturning arm cos(alpha) cos(x), uplift at tan(alpha), and lie flat at pi/2. So SM1, SM2 and SM3
-    differ by the law "plastic" alone, and mmSM is a slower SM1. They balance at x = alpha; SM2 and SM3 with the law
-    "plastic" where sin(x) = tan(alpha): there alpha must be below pi/4, for a stouter block never overturns on it.
+    differ by the law "plastic" alone, and mmSM is a slower SM1. They balance at x = alpha. SM2 and SM3 with the law
+    "plastic" balance where sin(x) = tan(alpha): there alpha must be below pi/4, for a stouter block never overturns on
+    it.
 
     Equation 9 lets the weight lean in SM2 although its mass is at the pivot; it is taken as printed. Codes that shake
     SM2 by a moment, or use linear geometry, have the arm cos(alpha): `Equation` does that.
@@ -53,14 +55,14 @@ class Spring(AbstractEquation):
         self.masses = None if masses is None else whole("masses", masses, 2)
 
     def moments(self, block: Block | Side) -> Coefficients:
-        """Moment of the spring and of the weight, as far as they are kept apart; arm cos(alpha) cos(x)."""
+        """Return the moments of the spring and of the weight, where the law separates these; arm cos(alpha) cos(x)."""
         found = self._moments(block)
         if self.masses is None:
             return found
         return found.times(1 / (1 + 1 / (2 * (self.masses - 1) ** 2)))  # moments of inertia, block over column
 
     def _moments(self, block: Block | Side) -> Coefficients:
-        """The same over the block's moment of inertia."""
+        """Return the moments over the block's moment of inertia."""
         alpha, leans_by_height = self.balanced("block.alpha", block.alpha), self.kind in ("SM2", "SM3")
         sine, cosine = sine_cosine(alpha)
         arm = Terms(cosine=cosine)
@@ -72,7 +74,7 @@ class Spring(AbstractEquation):
         return Coefficients(Terms(constant=sine, sine=-weight), arm)  # D&F 2017, 6, 15; 9, 12
 
     def balanced(self, name: str, alpha: Inexact[Array, "..."]) -> Inexact[Array, "..."]:
-        """A slenderness angle, checked where the spring balances no others; what is none was seen before."""
+        """Check a slenderness angle where the spring balances only some; an earlier check has rejected NaN."""
         if self.law != "plastic" or self.kind not in ("SM2", "SM3"):
             return alpha
         message = f"be below pi/4 in Spring({self.kind!r}, law='plastic'), which never overturns above"
@@ -80,5 +82,5 @@ class Spring(AbstractEquation):
 
     @property
     def feels_weight(self) -> bool:
-        """The moment of a spring does not."""
+        """Return False: the moment of a spring does not change with the weight."""
         return False

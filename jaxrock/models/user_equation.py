@@ -18,7 +18,7 @@ from jaxrock.models.equation import AbstractEquation, AbstractMoments, Angle, Sc
 from jaxrock.numerics.choice import where
 from jaxrock.numerics.lookup import pick, stretch_from
 
-_CREEP = 1e-30  # a velocity at which nothing but what jumps is felt
+_CREEP = 1e-30  # a velocity so small that only a jump at zero velocity shows
 
 
 class Equation(AbstractEquation):
@@ -32,11 +32,11 @@ class Equation(AbstractEquation):
 
     - `restoring`: restoring moment over m g R; positive at x = 0. Its first zero is the unstable equilibrium.
     - `arm`: overturning arm over R; positive at x = 0. None: 1.
-    - `dissipation`: moment over m g R against the motion, zero at rest. None: none.
+    - `dissipation`: moment over m g R against the motion, zero at rest. None: zero.
     - `acceleration`: instead of the three, the whole right-hand side: acceleration(x, v, s u, block), linear in s u.
     - `falls_flat`: whether a block at a rotation of pi/2 lies on its side.
     - `bends`: (k,) opening angles [rad], above 0 and growing, at which a derivative of the functions jumps, such as
-      contact with a stop: steps end there. None: nowhere.
+      contact with a stop: steps end there. None: no such angle.
 
     A vertical acceleration v [g] multiplies the restoring moment by 1 + v.
 
@@ -44,9 +44,9 @@ class Equation(AbstractEquation):
     and pi/2. Dry friction is nearly k tanh(v/w), with a small w. At a bend that `bends` does not list, values keep the
     tolerance, but slopes are off by 1e-5 to 1e-3, without a warning.
 
-    Functions that are Equinox modules may carry parameters to differentiate. They may read variables that change: every
-    call of the package sees current values (under your `jax.jit`, those of the trace). A block that has stopped below
-    its unstable equilibrium after the motion counts as safe: dissipation does not lift it.
+    Functions that are Equinox modules may carry parameters to differentiate. Functions may read variables that change:
+    every call of the package sees current values (under your `jax.jit`, those of the trace). A block that has stopped
+    below its unstable equilibrium after the motion counts as safe: dissipation does not lift it.
 
     **Raises:** ValueError where neither or both ways are used. A call raises it for a block that does not stand by the
     equation, for dissipation that jumps at rest, and for an acceleration that is not linear in the push.
@@ -80,18 +80,18 @@ class Equation(AbstractEquation):
             self.bends = checked("bends", angles, "grow from each to the next", _grow)
 
     def moments(self, block: Block | Side) -> "FunctionMoments":
-        """What the engine asks of the equation, for one block."""
+        """Return the moments of one block, as the engine calls them."""
         return FunctionMoments(self._acceleration, block, bends_at=self.bends)
 
     def at_rest(self, block: Block | Side) -> tuple[Scalar, Scalar]:
-        """Restoring moment and overturning arm just after uplift, which must be positive."""
+        """Return the restoring moment and overturning arm just after uplift, which must be positive."""
         zero = jnp.zeros_like(block.alpha)
         alone, pushed = (self._acceleration(zero, zero, push, as_functions_see(block)) for push in (zero, zero + 1))
         return -alone, alone - pushed
 
     def faults(self, block: Block | Side) -> dict[str, Bool[Array, ""]]:
-        """What is wrong with the functions just after uplift, and at half the slenderness, in words, and whether it
-        is."""
+        """Check the functions just after uplift, and at half the slenderness. Return messages, each with whether its
+        fault occurs."""
         zero = jnp.zeros_like(block.alpha)
         alone, arm = self.at_rest(block)
 
@@ -114,12 +114,12 @@ class Equation(AbstractEquation):
 
     @property
     def falls_flat(self) -> bool:
-        """As it was given."""
+        """Return the argument `falls_flat`."""
         return self._falls_flat
 
     @property
     def is_series(self) -> bool:
-        """Nothing is known of the functions but their values."""
+        """Return False: the functions are known only by their values."""
         return False
 
 
@@ -143,7 +143,8 @@ class Functions(eqx.Module):
 
 
 def as_functions_see(block: Block | Side) -> Block | Side:
-    """A block with a restitution, given or not, so that functions are traced for all blocks of a kind at once."""
+    """Replace the restitution of a block by a constant law, so that one trace of the functions serves all blocks of a
+    kind."""
     if isinstance(block, Side):
         return block
     law = eqx.tree_at(lambda constant: constant.value, Constant(0.0), block.restitution)
@@ -155,13 +156,13 @@ class FunctionMoments(AbstractMoments):
 
     function: Callable
     block: Block | Side
-    factor: Scalar | float | None  # of all accelerations (see `times`)
+    factor: Scalar | float | None  # multiplies all accelerations (see `times`)
     bends_at: Inexact[Array, " bends"] | None
-    stretch: tuple[Scalar, Scalar] | None  # continues as a straight line beyond it; None: nowhere
+    stretch: tuple[Scalar, Scalar] | None  # continues as a straight line beyond this interval; None: nowhere
     restoring_at_rest: Scalar
     arm_at_rest: Scalar
     saddle: Scalar  # first zero of the restoring moment, at most pi/2
-    firm: Scalar  # up to where it may right itself again (`last_rise`)
+    firm: Scalar  # angle past which the block gets no firmer (`last_rise`)
 
     def __init__(
         self,
@@ -173,7 +174,7 @@ class FunctionMoments(AbstractMoments):
         self.function, self.block, self.factor = function, as_functions_see(block), factor
         self.bends_at, self.stretch = bends_at, None
         zero = Angle.of(jnp.zeros_like(block.alpha))
-        # What does not stand has no threshold (`standing` raises before).
+        # A block that does not stand has a NaN threshold (`standing` raises before).
         self.restoring_at_rest, self.arm_at_rest = (
             jnp.where(moment > 0, moment, jnp.nan) for moment in (self.restoring(zero), self.arm(zero))
         )
@@ -181,7 +182,7 @@ class FunctionMoments(AbstractMoments):
         self.firm = last_rise(self, block.alpha)
 
     def acceleration(self, angle: Angle, velocity: Scalar, push: Scalar, weight: Scalar | None = None) -> Scalar:
-        """Acceleration of the opening angle per (p t)^2; push = side u, weight = 1 + v (None: 1)."""
+        """Return the acceleration of the opening angle per (p t)^2; push = side u, weight = 1 + v (None: 1)."""
         value = self._value(angle, velocity, push)
         return value if weight is None else value - (weight - 1) * self.restoring(angle)
 
@@ -196,7 +197,7 @@ class FunctionMoments(AbstractMoments):
         return value if self.factor is None else self.factor * value
 
     def times(self, factor: Scalar | float) -> "FunctionMoments":
-        """As for any moments."""
+        """Multiply all accelerations by a factor."""
         factor = factor if self.factor is None else factor * self.factor
         return FunctionMoments(self.function, self.block, factor, self.bends_at)
 
@@ -216,36 +217,37 @@ class FunctionMoments(AbstractMoments):
         return moments, where(ends, angle, jnp.pi)
 
     def restoring(self, angle: Angle) -> Scalar:
-        """Restoring moment over m g R at an opening angle."""
+        """Return the restoring moment over m g R at an opening angle."""
         zero = jnp.zeros_like(angle.value)
         return -self._value(angle, zero, zero)
 
     def arm(self, angle: Angle) -> Scalar:
-        """Overturning moment over m R u g at an opening angle."""
+        """Return the overturning moment over m R u g at an opening angle."""
         zero = jnp.zeros_like(angle.value)
         return self._value(angle, zero, zero) - self._value(angle, zero, zero + 1)
 
     def repulsion(self, angle: Angle, push: Scalar, weight: Scalar | None = None) -> Scalar:
-        """How fast nearby angles part, per angle."""
+        """Return the rate at which nearby angles diverge, per angle."""
         zero = jnp.zeros_like(angle.value)
         return jax.grad(lambda x: self.acceleration(Angle.of(x), zero, push, weight))(angle.value)
 
     @property
     def stiffness(self) -> Scalar:
-        """One, or the factor: nothing else is known of the shape of the function."""
+        """Return one, or the factor: the slope of the function at the balance is unknown."""
         one = jnp.ones_like(self.saddle)
         return one if self.factor is None else self.factor * one
 
     def held(self, angle: Angle, velocity: Scalar, push: Scalar, weight: Scalar | None = None) -> Scalar:
-        """As for any moments; far from rest the arm may be negative."""
+        """Return the largest inward acceleration under a forcing of at most this size; far from rest the arm may be
+        negative."""
         return self.held_either_way(angle, velocity, push, weight)
 
     def held_manifold(self, angle: Angle, hold: Scalar, push: Scalar, weight: Scalar | None = None) -> Scalar:
-        """As for any moments; infinite, because nothing is known of the function beyond this angle."""
+        """Return infinity: the function beyond this angle is unknown."""
         return jnp.full_like(hold, jnp.inf)
 
     def unheld_manifold(self, angle: Angle, hold: Scalar, push: Scalar, weight: Scalar | None = None) -> Scalar:
-        """As for any moments."""
+        """Return infinity below `firm`, where a moment further on may hold the block, else zero."""
         return jnp.where(angle.value < self.firm, jnp.inf, 0.0)
 
 
@@ -257,5 +259,5 @@ def _straight_beyond(low: Scalar, high: Scalar, function: Callable, x: Scalar) -
 
 
 def _grow(angles):
-    arrays = np if isinstance(angles, np.ndarray) else jnp  # NumPy compiles nothing
+    arrays = np if isinstance(angles, np.ndarray) else jnp  # NumPy compiles no program
     return angles[1:] > angles[:-1] if angles.size > 1 else arrays.ones(1, bool)

@@ -1,4 +1,4 @@
-"""What `outcome` and `simulate` take alike: the block's kind, the initial state, the engine."""
+"""Checks of arguments that `outcome` and `simulate` share: the kind of the block, the initial state, the engine."""
 
 import jax
 import jax.numpy as jnp
@@ -21,27 +21,27 @@ Scalar = Inexact[Array, ""]
 RigidBlock = Block | AsymmetricBlock
 AnyBlock = RigidBlock | FlexibleBlock
 
-USUAL = Housner()  # the model of a rigid block that nothing is said about
+USUAL = Housner()  # the default model of a rigid block
 
 
 def engine_of(engine: AbstractEngine | None, model: AbstractEquation, motion: AbstractMotion) -> AbstractEngine:
-    """The engine that was asked for, or the usual one of a model.
+    """Return the engine given, or the default of the model.
 
-    Under a record a step goes from sample to sample, however loose the tolerance; a tight one decides more scenes, in
+    Under a record, steps run from sample to sample, however loose the tolerance; a tight one decides more scenes, in
     the same time.
     """
     if engine is not None:
         return engine
     if model.is_series:
         return Series()
-    from jaxrock.engines.diffrax.arcs import Diffrax  # it takes a fifth of a second
+    from jaxrock.engines.diffrax.arcs import Diffrax  # the import takes a fifth of a second
 
     check_single(motion=motion)
     return Diffrax(rtol=1e-10) if POLICY.is_record(motion.knots.size - 1) else Diffrax()
 
 
 def start_of(initial: tuple[ArrayLike, ArrayLike], throw: bool = True) -> tuple[Scalar, Scalar]:
-    """Initial rotation and angular velocity, checked; what fails is not a number unless it is to `throw`."""
+    """Check initial rotation and angular velocity; without `throw`, invalid values become NaN."""
     if all(isinstance(x, float) and x == 0 for x in initial):
         return _at_rest(jnp.result_type(float))
     with throwing(throw):
@@ -52,11 +52,11 @@ _usual: dict[np.dtype, tuple[Scalar, Scalar]] = {}
 
 
 def _at_rest(precision: np.dtype) -> tuple[Scalar, Scalar]:
-    """The usual start, in the precision of the session: to make it takes a tenth of an outcome's time."""
+    """Return the default start, in the session's default precision. To make it takes a tenth of an outcome's time."""
     if precision in _usual:
         return _usual[precision]
     made = as_real("initial[0]", 0.0), as_real("initial[1]", 0.0)
-    if not is_traced(made):  # JAX traces what is known within some transformations
+    if not is_traced(made):  # JAX traces constants within some transformations
         _usual[precision] = made
     return made
 
@@ -67,7 +67,7 @@ def _start_of(initial: tuple[ArrayLike, ArrayLike]) -> tuple[Scalar, Scalar]:
         "initial[0]", rotation, "be a rotation in (-pi/2, pi/2)", lambda x: (x > -np.pi / 2) & (x < np.pi / 2)
     )
     velocity = as_real("initial[1]", velocity)
-    if not isinstance(velocity, jax.core.Tracer):  # of what is traced and not finite a status tells
+    if not isinstance(velocity, jax.core.Tracer):  # a status reports traced values that are not finite
         velocity = strength("initial[1]", velocity)
     return scalar("initial[0]", rotation), scalar("initial[1]", velocity)
 
@@ -75,11 +75,11 @@ def _start_of(initial: tuple[ArrayLike, ArrayLike]) -> tuple[Scalar, Scalar]:
 def steps_of_flexible(
     model: AbstractEquation, initial: tuple[ArrayLike, ArrayLike], engine: AbstractEngine | None
 ) -> dict[str, int]:
-    """The budget of steps for a flexible block; raise ValueError for what does not apply to one."""
+    """Return the step budget for a flexible block; raise ValueError for arguments that do not apply to one."""
     if model is not USUAL:
         raise ValueError("Argument `model` does not apply to a FlexibleBlock, whose equation is its own.")
-    start_of(initial)  # raises, if it is no start at all
-    # By NumPy: within `jax.jit` a comparison by JAX is traced, however well its sides are known.
+    start_of(initial)  # raises for an invalid start
+    # NumPy compares: within `jax.jit` a comparison by JAX is traced, even of concrete values.
     if is_traced(initial) or any(np.asarray(x) != 0 for x in initial):
         raise ValueError(
             f"Argument `initial` must be (0, 0) for a FlexibleBlock, which starts at rest, but is {shown(initial)}."

@@ -1,4 +1,4 @@
-"""Check the model of pure rocking: the friction that it needs, and whether the block stays on the ground."""
+"""Forces between block and ground, which test pure rocking: the friction it needs, and whether contact persists."""
 
 import jax
 import jax.numpy as jnp
@@ -22,22 +22,22 @@ from jaxrock.responses.history import Response, evaluation
 from jaxrock.responses.own_block import check_own
 
 Scalar = Inexact[Array, ""]
-_WITHIN = 8  # parts of each step at whose ends the extremes are looked for
+_WITHIN = 8  # parts of each step, at whose ends extremes are sought
 
 
 class Contact(AbstractTable):
-    """Forces of the ground on a block, over its weight, and what they need.
+    """Forces of the ground on a block, over its weight, and the friction that they need.
 
     - `time`: (samples,) those of the response [s].
     - `horizontal`, `normal`: (samples,) force of the ground, in the direction of positive ground acceleration and
       upward, over m g [-].
     - `friction`: (samples,) coefficient of friction needed, |horizontal|/normal [-]; infinite without contact.
-    - `friction_at_impact`: pair of those that the impacts need which end the stay on side 1, and on side 2 [-]; where
-      there is none, what any would.
-    - `impacted`: pair of whether there is an impact that ends the stay on side 1, and on side 2.
+    - `friction_at_impact`: pair of coefficients that the impacts need which end the stay on side 1, and on side 2 [-].
+      Without an impact it is the one that any impact would need.
+    - `impacted`: pair of whether an impact ends a stay on side 1, and on side 2.
     - `largest_friction`, `least_normal`: extremes over the rocking below the unstable equilibrium, impacts not
-      included, by parabolas through points of every step (1e-6 off where tests judge it). A toppling block may need
-      any friction in the end.
+      included, by parabolas through points of every step (1e-6 off where tests judge it). A toppling block may need any
+      friction in the end.
     - `keeps_contact`: whether `least_normal` is positive.
     """
 
@@ -79,8 +79,8 @@ def contact_forces(
 
     - `response`: of `simulate`, of one scene.
     - `block`: that of the response.
-    - `inertia_ratio`: m R^2/I about a corner [-], in (0, 1], of a symmetric `Block`; None: that of its `Rolling`, or
-      what its law of restitution knows (of a block that was made with an inertia ratio), or 3/4, a rectangle's. An
+    - `inertia_ratio`: m R^2/I about a corner [-], in (0, 1], of a symmetric `Block`. None: that of its `Rolling`, or
+      that of its law of restitution (of a block made with an inertia ratio), or 3/4, a rectangle's. An
       `AsymmetricBlock` has its own.
 
     **Returns:** a `Contact`.
@@ -99,7 +99,7 @@ def contact_forces(
 
 
 def _ratio_of(scene: Scene, block: Block | AsymmetricBlock, given: ArrayLike | None) -> ArrayLike:
-    """The inertia ratio that is given, or known of a symmetric block."""
+    """Return the inertia ratio that is given, or known for a symmetric block."""
     moments = scene.moments
     own = moments.ratio if isinstance(moments, RollingMoments) and isinstance(block, Block) else None
     if given is None:
@@ -127,7 +127,7 @@ def _contact(response: Response, block: Block | AsymmetricBlock, ratio: Scalar) 
     first, needed = _at_impacts(response, 1.0, *corners)
     second, needed2 = _at_impacts(response, -1.0, *corners[::-1])
     friction = _friction(horizontal, normal)
-    # Between steps, and where the block rests for good and no step is taken.
+    # Samples lie between the points of steps, and cover a final rest, which has no steps.
     saddles = [moments.saddle for moments in response.scene.both_moments]
     below = jnp.abs(rotation) < jnp.where(rotation < 0, saddles[1], saddles[0])
     largest = jnp.maximum(largest, jnp.max(jnp.where(below, friction, 0.0)))
@@ -138,13 +138,12 @@ def _contact(response: Response, block: Block | AsymmetricBlock, ratio: Scalar) 
 def _at_impacts(
     response: Response, side: float, here: tuple[Scalar, Scalar], there: tuple[Scalar, Scalar]
 ) -> tuple[Bool[Array, ""], Scalar]:
-    """Return whether impacts end a stay on a side, and the most friction that they need, or any would, if there is
-    none.
+    """Return whether impacts end a stay on a side, and the most friction that they need, or any would without impacts.
 
     `here`, `there`: horizontal and vertical distance of the centre from the corner that it leaves, and from the other.
     """
     scene, nodes = response.scene.on(side), response.trajectory.nodes
-    # Of a law that does not depend on the speed all impacts need the same.
+    # With a law that does not depend on the speed, all impacts need the same friction.
     ours = response.trajectory.impacted & (jnp.sign(nodes.impact_velocity) == -side)
     speeds = jnp.where(ours, jnp.abs(nodes.impact_velocity), 0.0)
     speeds = jnp.where(ours, speeds, speeds.max()) if scene.reset.depends_on_speed else speeds[:1]
@@ -154,12 +153,12 @@ def _at_impacts(
 
 
 def _friction(horizontal, normal):
-    lost = normal <= 0  # not where nothing is known
+    lost = normal <= 0  # false for NaN, too
     return jnp.where(lost, jnp.inf, jnp.abs(horizontal) / jnp.where(lost, 1.0, normal))
 
 
 def _forces(scene: Scene, sides: list, time: Scalar, rotation: Scalar, velocity: Scalar, side: Scalar | None = None):
-    """Horizontal and normal force over m g at an instant; a lying block is borne, too."""
+    """Return horizontal and normal force over m g at an instant; the ground bears a lying block, too."""
     acceleration, weight = _ground(scene, time)
     if side is None:
         side = jnp.where(rotation != 0, jnp.sign(rotation), jnp.sign(velocity))
@@ -170,7 +169,7 @@ def _forces(scene: Scene, sides: list, time: Scalar, rotation: Scalar, velocity:
     push, own = side * acceleration, (rate / scene.p) ** 2
     angular = scene.moments.acceleration(Angle.of(opening), side * velocity / scene.p, push, weight) / own
     rolled = scene.moments.rolled(Angle.of(opening))
-    # On a circle about the corner, if it does not roll.
+    # Without rolling, the centre moves on a circle about the corner.
     at = Rolled(jnp.cos(alpha - opening), jnp.sin(alpha - opening), jnp.zeros_like(alpha)) if rolled is None else rolled
     horizontal = acceleration + side * ratio * (at.height * angular + at.reach * speed**2)
     normal = weight + ratio * (at.reach * angular + (at.radius - at.height) * speed**2)
@@ -179,7 +178,7 @@ def _forces(scene: Scene, sides: list, time: Scalar, rotation: Scalar, velocity:
 
 
 def _ground(scene: Scene, time: Scalar) -> tuple[Scalar, Scalar]:
-    """Ground acceleration [g] and weight at a time, after a jump."""
+    """Return ground acceleration [g] and weight at a time, after a jump."""
     piece = jnp.searchsorted(scene.knots, time, side="right") - 1
     shaking: Shaking = scene.shaking(piece, time - scene.knots[piece], 0)[0]
     acceleration, weight = shaking.now
@@ -187,10 +186,11 @@ def _ground(scene: Scene, time: Scalar) -> tuple[Scalar, Scalar]:
 
 
 def _highest(values: Inexact[Array, " points"]) -> Scalar:
-    """The largest of a smooth function that is known at equal distances: of parabolas through each three points."""
+    """Return the maximum of a smooth function that is known at equal distances, by parabolas through each three points.
+    Return the maximum of a smooth function that is known at equal distances, by parabolas through each three points."""
     known = jnp.isfinite(values[:-2] + values[1:-1] + values[2:])
     left, middle, right = (jnp.where(known, each, 0.0) for each in (values[:-2], values[1:-1], values[2:]))
-    top = (middle >= left) & (middle >= right) & known  # what is infinite would spoil slopes in reverse mode
+    top = (middle >= left) & (middle >= right) & known  # infinity would make reverse-mode derivatives NaN
     curvature = jnp.where(top & (2 * middle > left + right), 2 * middle - left - right, jnp.inf)
     rise = jnp.where(top, (right - left) ** 2, 0.0) / (8 * curvature)
     return jnp.maximum(jnp.max(values), jnp.max(jnp.where(top, middle + rise, -jnp.inf)))
@@ -198,13 +198,13 @@ def _highest(values: Inexact[Array, " points"]) -> Scalar:
 
 @jax.jit
 def _extremes(response: Response, sides: list) -> tuple[Scalar, Scalar]:
-    """Largest friction needed and least normal force below the saddle, over points in all steps."""
+    """Return largest friction needed and least normal force below the saddle, over points in all steps."""
     path = response.trajectory
     stepper, nodes, times = path.stepper, path.nodes.start, path.times
     shares, follow = jnp.linspace(0.0, 1.0, _WITHIN + 1), evaluation(stepper)
 
     def step(node, start, end):
-        # What is infinite has derivatives that are not numbers, wherever it is left out later.
+        # Infinity has NaN derivatives, even where a later `where` discards it.
         is_step, ends = jnp.isfinite(start), jnp.isfinite(end)
         start, end = jnp.where(is_step, start, 0.0), jnp.where(ends, end, 0.0)
         lasts = jnp.where(ends, end - start, 0.0)

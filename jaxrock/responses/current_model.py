@@ -1,4 +1,4 @@
-"""Models whose functions are a user's own, as they are when they are asked for."""
+"""Models with a user's own functions, as these are at the time of a call."""
 
 import functools
 import operator
@@ -22,16 +22,16 @@ from jaxrock.transforms.user_function import UserFunction
 
 
 def current_model(model: AbstractEquation, block: Block | AsymmetricBlock, *scene) -> AbstractEquation:
-    """A model whose functions are what they are now, wherever in it they are: a pytree for `jax.jit`.
+    """Return a model with the current version of all its functions: a pytree for `jax.jit`.
 
-    A class of models of the user's own is known by what it is and by its fields, as any pytree: its methods are part of
-    all that the engine computes, and tracing that at every call would take a second. So methods should read nothing
-    that changes but fields. The same holds for classes of motions.
+    A user's own class of models is identified by its type and its fields, like any pytree. Its methods are part of the
+    traced computation, and tracing at every call would take a second. So methods should read nothing that changes but
+    fields. The same holds for classes of motions.
 
     **Arguments:**
 
     - `model`: any model.
-    - `block`, `scene`: what it will be asked for; their kind and precision count.
+    - `block`, `scene`: arguments of its later use; their kind and precision count.
 
     **Returns:** the model; the same object, where it holds no functions.
     """
@@ -52,18 +52,20 @@ def current_model(model: AbstractEquation, block: Block | AsymmetricBlock, *scen
 def standing(
     block: Block | AsymmetricBlock, model: AbstractEquation, engine: AbstractEngine, throw: bool = True
 ) -> Block | AsymmetricBlock:
-    """The block, with checks that it stands by an equation of the user's own (of `current_model`), which is one, or
-    balances on a spring, or by a model of the user's own that `engine` solves by its balance. Where nothing is to be
-    raised (`throw`), one that does not is not a number.
+    """Return the block, with checks that the model has a balance for it.
 
-    Here and not where the engines ask for moments: what they compile then calls back to nothing, and JAX can keep it.
+    Checked are an `Equation` (of `current_model`) at rest, a block on a spring, and a user's own model that `engine`
+    solves by its balance. Without `throw`, a block that fails becomes NaN.
+
+    The checks are here and not in the engines, so that compiled engines contain no host callbacks, and JAX can cache
+    them.
     """
     if isinstance(model, Spring):
         return _balanced(block, model, throw)
     if not isinstance(model, Equation) and (is_ours(model) or not isinstance(engine, Series)):
         return block
     for side in (block,) if isinstance(block, Block) else block.sides:
-        # Known numbers: one call, not fifty. Of others checks within the functions belong to this trace.
+        # For concrete values: one call, not fifty. For traced ones, checks within the functions belong to this trace.
         found = _faults(model, side) if is_traced((model, side)) else _compiled_faults(model, side)
         if not throw:
             block = _none_where(jnp.stack(list(found.values())).any(), block)
@@ -75,14 +77,14 @@ def standing(
 
 @jax.jit
 def _none_where(bad: Bool[Array, ""], block: Block | AsymmetricBlock) -> Block | AsymmetricBlock:
-    # What is declared whole counts, or is a place among others.
+    # Integer leaves are counts or indices.
     return jax.tree.map(
         lambda x: jnp.where(bad, jnp.nan, x) if jnp.issubdtype(jnp.result_type(x), jnp.inexact) else x, block
     )
 
 
 def _balanced(block: Block | AsymmetricBlock, spring: Spring, throw: bool) -> Block | AsymmetricBlock:
-    """The block, whose angles are checked, and marked where nothing is to be raised."""
+    """Check the angles of the block on the spring; without `throw`, mark invalid ones."""
     for name in ("alpha",) if isinstance(block, Block) else ("alpha1", "alpha2"):
         alpha = getattr(block, name)
         with throwing(throw):
@@ -120,7 +122,7 @@ def _is_functions(node) -> bool:
 
 @functools.cache
 def _example(kind: type) -> Block | Side:
-    """A block `as_functions_see` those of its kind."""
+    """Return a block of this kind, in the form that `as_functions_see` gives."""
 
     def made():
         with put_down():

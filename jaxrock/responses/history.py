@@ -45,9 +45,9 @@ class Response(AbstractTable):
     - `impact_count`, `max_rotation` [rad], `time_of_max` [s], `max_velocity` [rad/s]: within the duration.
     - `overturned`, `margin`, `status`: as in `Outcome`; the verdict looks beyond a duration that covers the motion.
 
-    Beyond the engine's last step, where it had too few (see `status`), rotation and velocity are not numbers.
-    Under jit or vmap the arrays of impacts and peaks have fixed length: times are filled up with inf, values
-    with 0. Outside they hold the events alone.
+    Where the step budget ended the history early (see `status`), later rotations and velocities are NaN. Under jit or
+    vmap the arrays of impacts and peaks have fixed length: times are padded with inf, values with 0. Outside they hold
+    the events alone.
     """
 
     time: Inexact[Array, "..."]
@@ -62,15 +62,15 @@ class Response(AbstractTable):
 
     @called_by_users
     def __call__(self, time: Values) -> tuple[Inexact[Array, "..."], Inexact[Array, "..."]]:
-        """Rotation and angular velocity.
+        """Return rotation and angular velocity.
 
         **Arguments:**
 
         - `time`: any shape, between 0 and duration [s].
 
-        **Returns:** rotation [rad] and angular velocity [rad/s], of the shape of `time`, to the accuracy of the
-        steps themselves; at an impact the velocity after it. A block that has fallen lies still (by a linear equation,
-        which knows no flat, from where nothing to come could bring it back).
+        **Returns:** rotation [rad] and angular velocity [rad/s], of the shape of `time`, to the accuracy of the steps
+        themselves; at an impact the velocity after it. A block that has fallen lies still. A linear equation, which has
+        no horizontal position, stops it where no forcing to come could bring it back.
 
         **Raises:** ValueError for a time outside the history.
         """
@@ -78,7 +78,7 @@ class Response(AbstractTable):
 
     @property
     def impact_count(self) -> Int[Array, "..."]:
-        """Impacts within the duration."""
+        """Number of impacts within the duration."""
         return self.summary.impact_count
 
     @property
@@ -93,7 +93,7 @@ class Response(AbstractTable):
 
     @property
     def time_of_max(self) -> Scalar:
-        """When `max_rotation` was reached [s]."""
+        """Time of `max_rotation` [s]."""
         return self.summary.time_of_max
 
     @property
@@ -108,17 +108,17 @@ class Response(AbstractTable):
 
     @property
     def status(self) -> Status:
-        """What the numbers are worth."""
+        """The `Status` of the computation: any other than successful invalidates the numbers."""
         return self.summary.status
 
     @property
     def duration(self) -> Inexact[Array, "..."]:
-        """How long the block was followed [s]."""
+        """Length of the history [s]."""
         return self.trajectory.duration
 
     @property
     def scene(self) -> Scene:
-        """What was simulated."""
+        """The scene that was simulated."""
         return self.trajectory.stepper.scene
 
     @property
@@ -150,7 +150,7 @@ class Response(AbstractTable):
         return self._peaks[1]
 
 
-# What `Trajectory.events` takes.
+# Arguments `told` of `Trajectory.events`.
 
 
 def _impacts_of(xp: Any, path: Trajectory) -> tuple:
@@ -162,7 +162,7 @@ def _impacts_of(xp: Any, path: Trajectory) -> tuple:
 def _peaks_of(xp: Any, path: Trajectory) -> tuple:
     nodes = path.nodes.start
     turned = (nodes.velocity == 0) & (nodes.side != 0) & (nodes.opening > 0) & xp.isfinite(path.times)
-    # A step through a piece without a length leaves a block that turns where it is.
+    # A step through a zero-length piece leaves a block that turns in place.
     stays = turned[:-1] & (nodes.opening[1:] == nodes.opening[:-1])
     turned = turned & ~xp.concatenate([turned[:1] & False, stays])
     return turned, path.times, (path.times, xp.inf), (nodes.side * nodes.opening, 0.0)
@@ -211,9 +211,9 @@ def simulate(
     **Arguments:**
 
     - `block`, `motion`, `model`, `initial`, `engine`, `throw`: as in `outcome`.
-    - `duration`: how long to follow the block [s], positive; None: the motion and 10/p of free rocking.
-    - `samples`: number of equally spaced points of the ready-made history, at least 2; any other time is had
-      by calling the result.
+    - `duration`: time for which to follow the block [s], positive; None: the motion and 10/p of free rocking.
+    - `samples`: number of equally spaced points of the ready-made history, at least 2; a call of the result gives any
+      other time.
 
     **Returns:** a `Response`; of a flexible block a `FlexibleResponse`.
 
@@ -254,7 +254,7 @@ def _simulate(block, motion, model, initial, duration, engine) -> tuple[Summary,
 
 @by_numpy_or_one_program()
 def _evaluate(path: Trajectory, time):
-    """Rotation [rad] and angular velocity [rad/s] at times."""
+    """Evaluate rotation [rad] and angular velocity [rad/s] at times."""
     return _after_nodes(path.stepper, *path.before(time, path.nodes.start), path.duration, time.shape)
 
 
@@ -264,7 +264,8 @@ def _after_nodes(stepper: AbstractStepper, node, elapsed, duration, shape):
 
 
 def evaluation(stepper: AbstractStepper) -> Callable:
-    """`at(node, elapsed)`: rotation [rad] and angular velocity [rad/s], so long after a node and before the next."""
+    """Return `at(node, elapsed)`: rotation [rad] and angular velocity [rad/s], `elapsed` seconds after a node and
+    before the next."""
     if stepper.engine.reverse:
         return lambda node, elapsed: _at((stepper, Node.of(node), elapsed))
     stepper = _moving_in_evaluation(stepper)
@@ -281,7 +282,7 @@ def evaluation(stepper: AbstractStepper) -> Callable:
 
 
 def _moving_in_evaluation(stepper: AbstractStepper) -> AbstractStepper:
-    """The same, of which nothing moves but what an evaluation depends on."""
+    """Return the stepper with tangents only in the fields that an evaluation depends on."""
     scene, still = stepper.scene, jax.lax.stop_gradient(stepper)
     moving = {name: getattr(scene, name) for name in ("moments", "far", "p", "motion", "knots", "scales")}
     moved: Any = {"scene": replace(still.scene, **moving)}  # a field of all that are no base
@@ -289,16 +290,16 @@ def _moving_in_evaluation(stepper: AbstractStepper) -> AbstractStepper:
 
 
 def _at(given) -> tuple[Scalar, Scalar]:
-    """The same, so long after a node."""
+    """Return rotation [rad] and angular velocity [rad/s] at a time after a node."""
     stepper, node, elapsed = given
     opening, speed = stepper.evaluate(node, elapsed)
     # The last node is the end of the history: the block lies, rests, or is caught in motion there.
     lies = node.done & (node.opening >= jnp.pi / 2)
     caught = with_derivatives_of((node.opening, node.velocity * stepper.scene.p), (opening, speed))
     opening, speed = (jnp.where(node.done, end, x) for end, x in zip(caught, (opening, speed)))
-    if isinstance(stepper.engine, Series):  # Diffrax knows an impact to its tolerance only
-        # Hops of rounding height, by which a block comes to rest, are no steps: it lies there. (Not at an impact, whose
-        # time is rounded.)
+    if isinstance(stepper.engine, Series):  # Diffrax locates an impact only to its tolerance
+        # Hops of rounding height, by which a block comes to rest, are no steps: it lies there. Rounding of an impact
+        # time is excluded.
         rounding = 64 * float(jnp.finfo(opening.dtype).eps)
         hops = opening < -rounding * (stepper.scene.alpha + jnp.abs(speed) * (stepper.time(node) + elapsed))
         opening, speed = jnp.where(hops, 0.0, opening), jnp.where(hops, 0.0, speed)

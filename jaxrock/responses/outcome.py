@@ -1,4 +1,4 @@
-"""What becomes of a block under a motion: peak, verdict, margin."""
+"""The outcome of a block under a motion: peak, verdict, margin."""
 
 from typing import Annotated, overload
 
@@ -34,37 +34,40 @@ Scalar = Inexact[Array, "..."]
 
 
 class Outcome(AbstractTable):
-    """What came of a scene: the motion, and the free stage after it to its end.
+    """Outcome of a scene: the motion, and the free stage after it to its end.
 
     - `max_rotation`: largest |rotation| [rad]; infinite if the block overturned.
     - `max_velocity`: largest |angular velocity| [rad/s]; infinite if the block overturned.
-    - `time_of_max`: when `max_rotation` was reached [s]; infinite if the block overturned.
+    - `time_of_max`: time of `max_rotation` [s]; infinite if the block overturned.
     - `impact_count`: impacts during the motion, and those after it if the block overturns after them (one, of an
-      asymmetric block up to two). The impacts without end of a block that comes to rest are counted down to hops of
+      asymmetric block up to two). The infinitely many impacts of a block that comes to rest are counted down to hops of
       rounding height.
     - `overturned`: the verdict.
     - `margin`: signed distance to overturning [-]: positive safe, negative overturned, zero on the boundary.
-    - `differentiable`: whether the derivatives of `max_rotation` are those of a smooth function here: not where two
-      peaks tie, or where before the peak an impact is grazed (both within 1e-9, in single precision within 5e-4, of the
-      peak and of the slenderness angle); nor if the block overturned. Where an impact or the uplift falls on a jump of
-      the motion, and in a tie, derivatives are those of one side.
-    - `clearance`: how far from a graze the block has been before the peak [rad]: the least height at which it turned
-      back before the ground, or the least depth to which it would have come where it hit the ground while being slowed
-      down; infinite if there was neither. Where it is zero the number of impacts changes.
+    - `differentiable`: whether `max_rotation` is a smooth function here. It is not where two peaks tie, where an impact
+      before the peak is grazed, or if the block overturned. Ties and grazes count within 1e-9, in single precision
+      within 5e-4, of the peak and of the slenderness angle. Where an impact or the uplift falls on a jump of the
+      motion, and in a tie, derivatives are those of one side.
+    - `clearance`: distance from a graze before the peak [rad]: the least height at which the block turned back before
+      the ground, or the least depth to which it would have come where it hit the ground while being slowed down. It is
+      infinite if there was neither. Where it is zero the number of impacts changes.
     - `error`: estimated standard error of `max_rotation` from rounding and tolerance [rad]; infinite if overturned.
     - `status`: a `Status`. With any other than successful the numbers are not results.
 
-    The margin is the smallest squared distance from standing still in balance (Voyagaki et al. 2012, 3.11),
-    (velocity/p sin alpha)^2 + (acceleration/p^2 sin alpha)^2, over turning points and crossings of the
-    unstable equilibrium, the acceleration with or without the shaking, whichever is larger; if the block overturned,
-    its negative over those since the last outward crossing. It is at most 1, except for a block that never uplifts:
-    2 - bound of the acceleration/threshold. In a free linear stage it is 1 - E/E_crit. (In the linear model
-    alpha stands for sin alpha.)
-    Its sign is the verdict's; it passes through zero smoothly where a block comes to balance on its corner, and
-    jumps where the shaking itself throws a stocky block flat, or where an impact or a turning point is only just
-    grazed. Of an asymmetric block it is the smaller of both sides'; where a block that just stands on its stronger
-    side comes back to fall on the other, it touches zero from below and jumps. Long after the start of a record the
-    passage through zero can be narrower than the last digit.
+    The margin is the smallest squared distance from standing still in balance (Voyagaki et al. 2012, 3.11), (velocity/p
+    sin alpha)^2 + (acceleration/p^2 sin alpha)^2, over turning points and crossings of the unstable equilibrium. The
+    acceleration is that with or without the shaking, whichever is larger. If the block overturned, the margin is the
+    negative distance over those since the last outward crossing.
+
+    It is at most 1, except for a block that never uplifts: 2 - bound of the acceleration/threshold. In a free linear
+    stage it is 1 - E/E_crit. (In the linear model alpha stands for sin alpha.)
+
+    Its sign is the verdict's. It passes through zero smoothly where a block comes to balance on its corner. It jumps
+    where the shaking itself throws a stocky block flat, or where an impact or a turning point is only just grazed.
+
+    For an asymmetric block it is the smaller of both sides'. Where a block that just stands on its stronger side comes
+    back to fall on the other, it touches zero from below and jumps. Long after the start of a record the passage
+    through zero can be narrower than the last digit.
     """
 
     max_rotation: Scalar
@@ -119,7 +122,7 @@ def outcome(
     engine: AbstractEngine | None = None,
     throw: bool = True,
 ) -> Outcome | FlexibleOutcome:
-    """Tell what becomes of a block under a motion and in the free stage after it.
+    """Compute the outcome of a block under a motion and in the free stage after it.
 
     **Arguments:**
 
@@ -127,13 +130,12 @@ def outcome(
     - `motion`: any motion, with a vertical one if it has one (`with_vertical`); the ground rests after its end.
     - `model`: `Housner()` (nonlinear), `Linear()`, a `Spring(...)`, an `Equation` or `AbstractEquation` of your own.
     - `initial`: rotation [rad] and angular velocity [rad/s] at time 0.
-    - `duration`: how long to follow a `FlexibleBlock` [s], positive; None: the motion and 10/p of free rocking. A rigid
-      block is followed to its end.
+    - `duration`: time for which to follow a `FlexibleBlock` [s], positive; None: the motion and 10/p of free rocking. A
+      rigid block is followed to its end.
     - `engine`: `Series(...)` or `Diffrax(...)`; None takes `Series()`, for an `Equation` or `Rolling` `Diffrax()`, of
       tolerance 1e-10 under a record.
-    - `throw`: whether a number outside of its range raises. False, for trial steps of optimisers: the outcome is not a
-      number, its derivatives are zero, and its status is `Status.not_finite`. Make block and motion with
-      `throw=False`, too.
+    - `throw`: whether a number outside of its range raises. False, for trial steps of optimisers: the outcome is NaN,
+      its derivatives are zero, and its status is `Status.not_finite`. Make block and motion with `throw=False`, too.
 
     **Returns:** an `Outcome`; of a flexible block, to which `model` and `initial` do not apply, a `FlexibleOutcome`.
 
@@ -179,7 +181,7 @@ def _on_tape(scene) -> Outcome:
 
 
 def outcome_like(scene) -> Outcome:
-    """What the outcome of a block, a motion and more looks like."""
+    """Return the shapes and dtypes of an outcome, from its inputs."""
 
     def made():
         real, count = jnp.zeros((), jnp.result_type(*jax.tree.leaves(scene[:2]))), jnp.zeros((), jnp.int32)
@@ -190,7 +192,7 @@ def outcome_like(scene) -> Outcome:
 
 
 def _passes(rounds: bool) -> Passes:
-    """The outcome in parts; in rounds where some blocks are lost long before others."""
+    """Return the outcome in parts, with rounds where some blocks are lost long before others."""
 
     def begin(scene):
         block, motion, model, initial, engine = scene

@@ -1,4 +1,4 @@
-"""Check that a block passed beside a response is the block of that response."""
+"""Check that a block given beside a response is that of the response."""
 
 from typing import Any
 
@@ -19,7 +19,7 @@ _SHARES = (
 
 
 def check_own(scene: Scene, block: Block | AsymmetricBlock) -> None:
-    """Raise ValueError where a block is known not to be that of a scene."""
+    """Raise ValueError where a concrete block differs from that of a scene."""
     if is_traced((scene, block)):
         return
     if isinstance(block, Block):
@@ -43,7 +43,7 @@ def check_own(scene: Scene, block: Block | AsymmetricBlock) -> None:
 
 
 def _resets_of(owner: Scene | Block | AsymmetricBlock) -> tuple[Reset, Reset]:
-    """The impacts that end stays on one side, and on the other."""
+    """Return the impacts that end stays on one side, and on the other."""
     if isinstance(owner, Scene):
         return owner.reset, owner.far_reset
     one, other = on_sides(owner.law, owner.corners) if isinstance(owner, Block) else owner.corners
@@ -53,13 +53,13 @@ def _resets_of(owner: Scene | Block | AsymmetricBlock) -> tuple[Reset, Reset]:
 
 @jax.jit
 def _shares(resets: tuple[Reset, Reset]) -> Inexact[Array, " six"]:
-    """What impacts at three speeds leave, on either side."""
+    """Return the velocity ratios of impacts at three speeds, on either side."""
     speeds = jnp.array([0.0, 0.2, 1.0])
     return jnp.concatenate([jax.vmap(reset.ratio)(speeds) for reset in resets])
 
 
 def _uplifts(scene: Scene, angles: list, rtol: float) -> tuple[np.ndarray, np.ndarray]:
-    """Accelerations that uplift a scene's block, and one of these angles, to either side [g]."""
+    """Return the accelerations that uplift a scene's block, and a block with these angles, to either side [g]."""
     own = np.array([moments.threshold for moments in scene.both_moments])
     for threshold in (np.tan, np.asarray):  # of nonlinear models, and of linear ones
         if np.isclose(np.min(own), threshold(scene.alpha), rtol=rtol, atol=0):
@@ -68,7 +68,8 @@ def _uplifts(scene: Scene, angles: list, rtol: float) -> tuple[np.ndarray, np.nd
 
 
 def _rates(scene: Scene, block: Block | AsymmetricBlock, angles: list) -> tuple[list, list]:
-    """Frequency parameter of the other side over that of the first, of a scene's block and of a given one."""
+    """Return the frequency parameter of the other side over that of the first, of a scene's block and of a given one.
+    Return the frequency parameter of the other side over that of the first, of a scene's block and of a given one."""
     if isinstance(block, Block):
         return [1.0], [1.0]
     here, there = (float(moments.arm_at_rest) for moments in scene.both_moments)

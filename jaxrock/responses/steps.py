@@ -1,7 +1,7 @@
-"""The steps of a history, and what is known of it as a whole: all of it that has to be followed.
+"""The steps of a history, and its summary: all outputs that require following the block.
 
-It is told a block, a motion, a model, how the block starts, when to stop [s] and an engine. What stands around the loop
-over the steps is machine code where the steps are.
+The inputs are a block, a motion, a model, the initial state, the time to stop [s] and an engine. The code around the
+loop over the steps is machine code where the steps are.
 """
 
 from dataclasses import fields
@@ -26,7 +26,7 @@ Scalar = Inexact[Array, "..."]
 
 
 class Summary(eqx.Module):
-    """What is known of a history as a whole (see `Response`)."""
+    """Summary of a history as a whole (see `Response`)."""
 
     impact_count: Int[Array, "..."]
     max_rotation: Scalar
@@ -40,7 +40,7 @@ class Summary(eqx.Module):
 
 
 def history_like(told) -> tuple:
-    """What `followed` returns looks like."""
+    """Return the shapes and dtypes of the results of `followed`."""
     *_, engine = told
 
     def made(*told):
@@ -54,9 +54,11 @@ def history_like(told) -> tuple:
 
 
 def followed(told) -> tuple[Int[Array, ""], Kept, Summary, list]:
-    """How many steps there are, what is kept of the states before all (and after the last), what is known of the
-    history, and the numbers of the stepper that followed it, without their derivatives: XLA need not compute these
-    again."""
+    """Follow a block, and return the number of steps, the kept states before all of them and after the last, the
+    summary, and the numbers of the stepper.
+
+    The numbers come without their derivatives: XLA need not compute these again.
+    """
     engine, end = told[-1], _summary
     stepper, state = prepared(started, told) if engine.in_lanes else started(told)
     state, nodes = states_of(stepper, state, engine.budget(stepper.scene, history=True), keep=Kept.of)
@@ -68,14 +70,14 @@ def followed(told) -> tuple[Int[Array, ""], Kept, Summary, list]:
 
 
 def on_tape(told) -> tuple[Int[Array, ""], Kept, Summary, list]:
-    """The same, so that reverse mode goes through the steps."""
+    """Return the results of `followed`, so that reverse mode goes through the steps."""
     stepper, state = started(told, taped=True)
     state, nodes = stepper.on_tape(state, stepper.engine.budget(stepper.scene, history=True))
     return state.steps, Kept.of(nodes), _summary((stepper, state)), fixed(numbers_of(stepper))
 
 
 def started(told, taped: bool = False) -> tuple[Any, State]:
-    """The stepper that follows a history, and the state at its start."""
+    """Return the stepper that follows a history, and the state at its start."""
     block, motion, model, initial, stop, engine = told
     scene = Scene.of(block, motion, model)
     stepper = engine.stepper(scene, stop.astype(scene.p.dtype), history=True, taped=taped)
@@ -100,7 +102,7 @@ def _summary(given) -> Summary:
 
 
 def _summary_like(given) -> Summary:
-    """What it looks like."""
+    """Return the shapes and dtypes of a summary."""
 
     def made(found):
         return Summary(*(getattr(found, field.name) for field in fields(Summary)))

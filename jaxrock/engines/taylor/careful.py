@@ -159,7 +159,7 @@ class TaylorStepper(AbstractStepper):
         scene = self.scene.on(state.side)
         moments: Any = scene.moments  # `Coefficients`: this engine solves no others
         moving = (state.side != 0) & ~state.overturned & (state.piece >= scene.pieces)
-        moving = moving & ((state.opening != 0) | (state.velocity != 0))  # lifted for no time at all
+        moving = moving & ((state.opening != 0) | (state.velocity != 0))  # not lifted for zero time
         other: Any = scene.both_moments[1]
         here, there = Visit(moments, scene.reset), Visit(other, scene.far_reset)
         visits = (here, there) if scene.far is None else (here, there, here)

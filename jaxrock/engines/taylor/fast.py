@@ -126,8 +126,8 @@ def _part(start: Start, terms: list[Scalar], room: Scalar, least: Scalar, most: 
 def _leaving(start: Start, terms: list[Scalar], part: _Part) -> tuple:
     """Return the velocity over a part, as `root_between` takes it, without the zero at its start.
 
-    It is divided by the time where the block stands still at the start, and by the square of the time where it leaves
-    rest with zero acceleration.
+    It is divided by the time where the block stands still at the start, and by its square where it leaves rest with
+    zero acceleration.
     """
     velocity, length = derivative(terms), part.length
     still = velocity[0] == 0

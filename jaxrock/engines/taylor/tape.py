@@ -142,7 +142,7 @@ def _changes(values: tuple, by: tuple, changes: tuple) -> tuple[list, list]:
         start, by_ground = rows
 
         def go(change):
-            # As `xs` of the scan all of them would be copied first.
+            # The scan would copy all of them first, if they were its `xs`.
             here = jax.tree.map(lambda x: jax.lax.dynamic_slice_in_dim(x, start, _TOGETHER), (nodes, ground))
             products = jax.vmap(lambda node, ground, by: _products(still, node, numbers, ground, by_numbers, by))
             going = start + jnp.arange(_TOGETHER) < steps
@@ -177,8 +177,11 @@ def _one(change: Array, step: tuple) -> tuple[Array, Array]:
 
 
 def _products(still: Stepper, node: State, numbers: tuple, ground: tuple, by_numbers: Array, by_ground: Array) -> tuple:
-    """Return, for a step, the Jacobian by the path, that of each extremum by itself and by the first ones, and the
-    tangent from all other inputs. `numbers`, `ground`: the inputs with tangents, and the rest."""
+    """Return, for a step, the Jacobian by the path, the factors of the extrema, and the tangent from all other inputs.
+
+    Factors are those by the extremum itself, and by the first ones. `numbers`, `ground`: the inputs with tangents, and
+    the rest.
+    """
     moving, rest = zip(numbers, ground)
     leaves = [*_path_of(node), *jax.tree.leaves(moving)]
     slopes = differentiable(_slopes, name="slopes of a step", in_lanes=True, derivatives="by directions")
