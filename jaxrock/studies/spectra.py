@@ -82,7 +82,7 @@ class OverturningMap(AbstractTable):
     - `state`: 0 safe, 1 overturned without impact, 2 overturned after impacts, -1 not computed (see `status`).
     - `max_rotation`: peak |rotation| over alpha [-]; infinite where the block overturned.
     - `impact_count`, `margin`, `status`: as in `Outcome`.
-    - `scene`: block, restitution, pulse, model and engine of the map, for `overturning_borders`.
+    - `scene`: slenderness, restitution, pulse, model and engine of the map, for `overturning_borders`.
     """
 
     frequency_ratio: Float[Array, " columns"]
