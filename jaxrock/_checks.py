@@ -31,7 +31,7 @@ def is_traced(tree: Any) -> bool:
 
 
 def is_at_hand(tree: Any) -> bool:
-    """Return whether NumPy may compute with the arrays in it: they are known, and where nobody has put them."""
+    """Return whether NumPy may compute with the arrays in it: they are concrete, and not committed to a device."""
     leaves = jax.tree.leaves(tree)
     return not is_traced(leaves) and not any(getattr(leaf, "committed", False) for leaf in leaves)
 

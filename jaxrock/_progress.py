@@ -23,7 +23,7 @@ class Progress:
 
 
 def _is_watched() -> bool:
-    """Return whether this is a terminal, or a notebook, whose standard error is none."""
+    """Return whether standard error is a terminal, or this is a notebook."""
     shell = getattr(sys.modules.get("IPython"), "get_ipython", lambda: None)()
     return sys.stderr.isatty() or "IPKernelApp" in getattr(shell, "config", ())
 

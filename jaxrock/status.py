@@ -61,7 +61,7 @@ class Status(Enumeration):
 
 
 def is_none(given: Any) -> Bool[Array, ""]:
-    """Return whether a number that is given is none."""
+    """Return whether any floating-point input is NaN."""
     numbers = [x for x in jax.tree.leaves(given) if jnp.issubdtype(jnp.result_type(x), jnp.inexact)]
     return jnp.stack([jnp.isnan(x).any() for x in numbers] or [jnp.asarray(False)]).any()
 

@@ -146,7 +146,7 @@ class TaylorStepper(AbstractStepper):
         return checked(self, state, jax.tree.map(lambda a, b: where(resting, a, b), waited, rocked))
 
     def on_tape(self, state: State, budget: int) -> tuple[State, State]:
-        """Follow a block so that reverse mode goes through, and return all states, as `states_of`."""
+        """Follow a block so that reverse mode differentiates its steps, and return all states, as `states_of`."""
         return on_tape(self, state, budget)
 
     def end_on_tape(self, state: State) -> State:
