@@ -261,8 +261,8 @@ def _flat(moments: Coefficients, falls_flat: bool) -> tuple[Scalar | float, Flag
 def _present(
     moments: Coefficients, opening: Scalar, velocity: Scalar, moving: Flag, falls_flat: bool, comes_back: bool
 ) -> _Stay:
-    """Compute the stay on the side where the block is when the motion ends; `comes_back`: whether its return matters.
-    Compute the stay on the side where the block is when the motion ends; `comes_back`: whether its return matters."""
+    """Compute the stay on the side where the block is when the motion ends; `comes_back`: whether its return
+    matters."""
     level, flat = _flat(moments, falls_flat)
     rate = jnp.sqrt(moments.stiffness)
     gap, speed = moments.saddle - opening, velocity / rate

@@ -28,7 +28,7 @@ class AbstractEngine(eqx.Module):
 
     @property
     def reverse(self) -> bool:
-        """Return whether reverse mode goes through this engine's own loops."""
+        """Return whether reverse mode differentiates this engine's own loops."""
         return False
 
     @property
@@ -40,7 +40,7 @@ class AbstractEngine(eqx.Module):
     def stepper(self, scene: Scene, stop: Scalar | None, history: bool, taped: bool = False) -> "AbstractStepper":
         """Return the stepper of a scene, up to the time `stop` [s] (None: the end of the motion).
 
-        With `taped`, reverse mode goes through its steps.
+        With `taped`, its steps support reverse mode.
         """
 
     @abc.abstractmethod
@@ -89,8 +89,8 @@ class AbstractStepper(eqx.Module):
 
     @abc.abstractmethod
     def evaluate(self, node: Node, elapsed: Scalar) -> tuple[Scalar, Scalar]:
-        """Return the opening angle [rad] and its velocity [rad/s], `elapsed` seconds after a node and before the next.
-        Return the opening angle [rad] and its velocity [rad/s], `elapsed` seconds after a node and before the next."""
+        """Return the opening angle [rad] and its velocity [rad/s], `elapsed` seconds after a node and before the
+        next."""
 
     def on(self: Stepper, side: Scalar) -> Stepper:
         """Return the stepper for a block that stands on this side."""

@@ -82,8 +82,8 @@ def approached(path: Arc, side: Scalar, balance: Scalar, end: Scalar, before: tu
 
 
 def still_to_come(outward: Scalar, inward: Scalar, grows: Scalar, decays: Scalar) -> Scalar:
-    """Return the least squared distance [rad^2] of free rocking from these amplitudes on; rates [1/s], both positive.
-    Return the least squared distance [rad^2] of free rocking from these amplitudes on; rates [1/s], both positive."""
+    """Return the least squared distance [rad^2] of free rocking from these amplitudes on; rates [1/s], both
+    positive."""
     safe = jnp.where(outward == 0, 1.0, outward)
     time = jnp.log(jnp.maximum(decays * inward**2 / (grows * safe**2), 1.0)) / (2 * (grows + decays))
     nearest = 2 * ((safe * jnp.exp(grows * time)) ** 2 + (inward * jnp.exp(-decays * time)) ** 2)

@@ -95,8 +95,8 @@ class Column(eqx.Module):
         return numbers.squares * bent + numbers.damping * bends
 
     def remaining_force(self, q: Modal, v: Modal, a: Modal, ground: Scalar) -> Modal:
-        """Return the forces on the modes that small rotations without P-Delta omit; `ground`: ground acceleration [g].
-        Return the forces on the modes that small rotations without P-Delta omit; `ground`: ground acceleration [g]."""
+        """Return the forces on the modes that small rotations without P-Delta omit; `ground`: ground acceleration
+        [g]."""
         unit, numbers = self._unit, self.numbers
         lean, force = unit.chords @ q, jnp.zeros_like(q)
         if self.finite:

@@ -75,8 +75,8 @@ class NonlinearScene(FlexibleScene):
         return self.tangents.column.displacements(self._clamped(motion)[0])
 
     def energy(self, motion: Inexact[Array, " states"]) -> tuple[Scalar, Scalar, Scalar]:
-        """Return kinetic energy, strain energy of the column, potential energy of base and weight, over m L^2 [1/s^2].
-        Return kinetic energy, strain energy of the column, potential energy of base and weight, over m L^2 [1/s^2]."""
+        """Return kinetic energy, strain energy of the column, potential energy of base and weight, over m L^2
+        [1/s^2]."""
         column, (q, v), rotation = self.tangents.column, self._clamped(motion), motion[-1]
         return column.kinetic(q, v), column.strain(q, rotation), column.potential(q, rotation)
 

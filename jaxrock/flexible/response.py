@@ -1,5 +1,5 @@
-"""The response of a flexible block to a motion: `simulate_flexible` gives its history, `outcome_flexible` the outcome.
-The response of a flexible block to a motion: `simulate_flexible` gives its history, `outcome_flexible` the outcome."""
+"""The response of a flexible block to a motion: `simulate_flexible` gives its history, `outcome_flexible` the
+outcome."""
 
 from typing import Annotated, Any
 

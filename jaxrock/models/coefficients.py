@@ -203,14 +203,14 @@ class Coefficients(AbstractMoments):
 
     @property
     def sinusoidal(self) -> bool:
-        """Return whether the restoring moment is a sinusoid, possibly with a constant (else it is one straight line).
-        Return whether the restoring moment is a sinusoid, possibly with a constant (else it is one straight line)."""
+        """Return whether the restoring moment is a sinusoid, possibly with a constant (else it is one straight
+        line)."""
         return self.restoring_terms.sine is not None
 
     @property
     def stiffness(self) -> Scalar:
-        """Return the rate at which the restoring moment falls at the saddle: k in k sin(saddle - x), or k (saddle - x).
-        Return the rate at which the restoring moment falls at the saddle: k in k sin(saddle - x), or k (saddle - x)."""
+        """Return the rate at which the restoring moment falls at the saddle: k in k sin(saddle - x), or k (saddle -
+        x)."""
         moment = self.restoring_terms
         if not self.sinusoidal:
             return jnp.asarray(-_or_zero(moment.line))

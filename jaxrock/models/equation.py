@@ -79,8 +79,8 @@ class AbstractMoments(eqx.Module):
 
     @abc.abstractmethod
     def repulsion(self, angle: Angle, push: Scalar, weight: Scalar | None = None) -> Scalar:
-        """Return the rate at which nearby angles diverge, per angle: the derivative of the acceleration by the angle.
-        Return the rate at which nearby angles diverge, per angle: the derivative of the acceleration by the angle."""
+        """Return the rate at which nearby angles diverge, per angle: the derivative of the acceleration by the
+        angle."""
 
     @abc.abstractmethod
     def times(self, factor: Scalar | float) -> "AbstractMoments":
@@ -130,8 +130,8 @@ class AbstractMoments(eqx.Module):
         raise NotImplementedError
 
     def rolled(self, angle: Angle) -> Rolled | None:
-        """Return the position of the centre of mass at an opening angle; None for a block that turns about its corner.
-        Return the position of the centre of mass at an opening angle; None for a block that turns about its corner."""
+        """Return the position of the centre of mass at an opening angle; None for a block that turns about its
+        corner."""
         return None
 
     @property

@@ -31,8 +31,8 @@ def moment(gap: Scalar, skew: Scalar) -> Scalar:
 
 
 def distance(gap: Scalar, skew: Scalar) -> Scalar:
-    """Return the speed that just reaches the balance, with the sign of the gap: the root of twice the work up to there.
-    Return the speed that just reaches the balance, with the sign of the gap: the root of twice the work up to there."""
+    """Return the speed that just reaches the balance, with the sign of the gap: the root of twice the work up to
+    there."""
     # The root of 4 sin^2(gap/2) + 2 skew (gap - sin(gap)), without cancellation.
     return gap * jnp.sqrt(sine_ratio(gap / 2) ** 2 + 2 * skew * gap * sine_lag(gap))
 

@@ -23,9 +23,8 @@ class Spring(AbstractEquation):
       `"linear"`: sin(alpha) (1 - x/alpha), a constant negative stiffness; `"plastic"`: sin(alpha), and the weight of
       the leaning column pulls by sin(x) (SM1, mmSM) or cos(alpha) sin(x) (SM2, SM3).
     - `masses`: of mmSM: their number, 2 or more, at equal distances from the base to the top. Each carries the part of
-      the column next to it, those at the ends half as much. Their mean height is R, and their moment of inertia 1 +
-      1/(2 (masses
-    - 1)^2) times the block's. None: a mass that is spread along the column, as printed.
+      the column next to it, those at the ends half as much. Their mean height is R. Their moment of inertia is
+      1 + 1/(2 (masses - 1)^2) times the block's. None: a mass that is spread along the column, as printed.
 
     All have the overturning arm cos(alpha) cos(x), uplift at tan(alpha), and lie flat at pi/2. So SM1, SM2 and SM3
     differ by the law "plastic" alone, and mmSM is a slower SM1. They balance at x = alpha. SM2 and SM3 with the law

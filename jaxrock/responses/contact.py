@@ -186,8 +186,8 @@ def _ground(scene: Scene, time: Scalar) -> tuple[Scalar, Scalar]:
 
 
 def _highest(values: Inexact[Array, " points"]) -> Scalar:
-    """Return the maximum of a smooth function that is known at equal distances, by parabolas through each three points.
-    Return the maximum of a smooth function that is known at equal distances, by parabolas through each three points."""
+    """Return the maximum of a smooth function that is known at equal distances, by parabolas through each three
+    points."""
     known = jnp.isfinite(values[:-2] + values[1:-1] + values[2:])
     left, middle, right = (jnp.where(known, each, 0.0) for each in (values[:-2], values[1:-1], values[2:]))
     top = (middle >= left) & (middle >= right) & known  # infinity would make reverse-mode derivatives NaN

@@ -150,7 +150,7 @@ class Response(AbstractTable):
         return self._peaks[1]
 
 
-# Arguments `told` of `Trajectory.events`.
+# Functions for the argument `told` of `Trajectory.events`.
 
 
 def _impacts_of(xp: Any, path: Trajectory) -> tuple:

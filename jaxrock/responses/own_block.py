@@ -64,12 +64,12 @@ def _uplifts(scene: Scene, angles: list, rtol: float) -> tuple[np.ndarray, np.nd
     for threshold in (np.tan, np.asarray):  # of nonlinear models, and of linear ones
         if np.isclose(np.min(own), threshold(scene.alpha), rtol=rtol, atol=0):
             return own, threshold(np.array(angles))
-    return own, own  # another model: it cannot be told
+    return own, own  # another model: no formula to compare with
 
 
 def _rates(scene: Scene, block: Block | AsymmetricBlock, angles: list) -> tuple[list, list]:
-    """Return the frequency parameter of the other side over that of the first, of a scene's block and of a given one.
-    Return the frequency parameter of the other side over that of the first, of a scene's block and of a given one."""
+    """Return the frequency parameter of the other side over that of the first, of a scene's block and of a given
+    one."""
     if isinstance(block, Block):
         return [1.0], [1.0]
     here, there = (float(moments.arm_at_rest) for moments in scene.both_moments)

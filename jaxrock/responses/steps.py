@@ -70,7 +70,7 @@ def followed(told) -> tuple[Int[Array, ""], Kept, Summary, list]:
 
 
 def on_tape(told) -> tuple[Int[Array, ""], Kept, Summary, list]:
-    """Return the results of `followed`, so that reverse mode goes through the steps."""
+    """Return the results of `followed`, computed so that reverse mode differentiates the steps."""
     stepper, state = started(told, taped=True)
     state, nodes = stepper.on_tape(state, stepper.engine.budget(stepper.scene, history=True))
     return state.steps, Kept.of(nodes), _summary((stepper, state)), fixed(numbers_of(stepper))

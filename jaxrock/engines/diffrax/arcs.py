@@ -113,7 +113,7 @@ class Diffrax(AbstractEngine):
 
     @property
     def controller(self) -> diffrax.AbstractStepSizeController | None:
-        """The step-size controller that was given."""
+        """The step-size controller, if given."""
         return self._controller.value
 
     @property
@@ -128,12 +128,12 @@ class Diffrax(AbstractEngine):
 
     @property
     def reverse(self) -> bool:
-        """Return whether reverse mode goes through this engine's own loops: with every adjoint but `ForwardMode`."""
+        """Return whether reverse mode differentiates this engine's own loops: with every adjoint but `ForwardMode`."""
         return not isinstance(self.adjoint, diffrax.ForwardMode)
 
     @property
     def in_lanes(self) -> bool:
-        """Return whether machine code runs the solve of an arc: unless reverse mode goes through it."""
+        """Return whether machine code runs the solve of an arc: unless reverse mode differentiates it."""
         return not self.reverse
 
     def stepper(self, scene: Scene, stop: Scalar | None, history: bool, taped: bool = False) -> "ArcStepper":

@@ -117,7 +117,7 @@ class TaylorStepper(AbstractStepper):
     tolerance: float = eqx.field(static=True)
     history: bool = eqx.field(static=True)
     doubt: float = eqx.field(static=True, default=8.0)  # the errors estimated here are rounding
-    taped: bool = eqx.field(static=True, default=False)  # reverse mode goes through the steps
+    taped: bool = eqx.field(static=True, default=False)  # the steps support reverse mode
 
     def shaking(self, piece: Int[Array, ""], local: Scalar) -> tuple[Shaking, Scalar]:
         """Return Taylor coefficients of the ground acceleration [g] in a piece, in time/unit, and the unit [s]."""
@@ -150,8 +150,8 @@ class TaylorStepper(AbstractStepper):
         return on_tape(self, state, budget)
 
     def end_on_tape(self, state: State) -> State:
-        """Follow a block so that reverse mode goes through, and return the last state, within the budget of an outcome.
-        Follow a block so that reverse mode goes through, and return the last state, within the budget of an outcome."""
+        """Follow a block so that reverse mode goes through, and return the last state, within the budget of an
+        outcome."""
         return end_on_tape(self, state)
 
     def finish(self, state: State) -> State:
@@ -318,8 +318,8 @@ class TaylorStepper(AbstractStepper):
         return impact(self, noted, hits.impact, velocity, ground, *fixed((steepest, reach)))
 
     def _matters(self, state: State, scaled) -> Flag:
-        """Return whether the only turning point of this step could be a new peak, or closer to overturning than before.
-        Return whether the only turning point of this step could be a new peak, or closer to overturning than before."""
+        """Return whether the only turning point of this step could be a new peak, or closer to overturning than
+        before."""
         always = jnp.ones_like(state.beyond)
         if self.history:
             return always

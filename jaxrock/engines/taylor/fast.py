@@ -79,8 +79,8 @@ class _Part(NamedTuple):
 
 
 def _part(start: Start, terms: list[Scalar], room: Scalar, least: Scalar, most: float) -> _Part:
-    """Return the certain part of a step, `most` long at most; `least`: bound of what the last coefficients contribute.
-    Return the certain part of a step, `most` long at most; `least`: bound of what the last coefficients contribute."""
+    """Return the certain part of a step, `most` long at most; `least`: bound of what the last coefficients
+    contribute."""
     one, before, first = start.one, terms[1], 2 * terms[2]
     cap = jnp.minimum(room, most)
     # Under records nearly all steps go as far as there is room: no root is taken for them.
@@ -201,8 +201,8 @@ def _meeting(start: Start, terms: list[Scalar], part: _Part, state: State) -> _M
 
 
 def _fastest(start: Start, terms: list[Scalar], part: _Part, at: Scalar, known: Scalar) -> tuple[Scalar, Flag]:
-    """Return the largest speed between the ends of a step where it exceeds the known one, and whether that is certain.
-    Return the largest speed between the ends of a step where it exceeds the known one, and whether that is certain."""
+    """Return the largest speed between the ends of a step where it exceeds the known one, and whether that is
+    certain."""
     velocity, zero = derivative(terms), jnp.zeros_like(at)
 
     def extremum():
@@ -215,8 +215,8 @@ def _fastest(start: Start, terms: list[Scalar], part: _Part, at: Scalar, known: 
 
 
 def _missed(stepper: TaylorStepper, terms: list[Scalar], at: Scalar, least: Scalar) -> Scalar:
-    """Return the truncation error of a step from its last terms; `least`: their bound. A step that ends early has less.
-    Return the truncation error of a step from its last terms; `least`: their bound. A step that ends early has less."""
+    """Return the truncation error of a step from its last terms; `least`: their bound. A step that ends early has
+    less."""
     if stepper.rounding == stepper.tolerance:
         return least
     contributed = last_size(terms) * at**stepper.order

@@ -32,7 +32,7 @@ _ESCAPES = 16  # pieces between tests whether a block beyond its saddle is lost
 class Glide(NamedTuple):
     """Sums over the pieces of a glide, from its start or since the errors were last applied."""
 
-    goes: Flag  # the next piece may still be free of events
+    goes: Flag  # the next piece may be free of events, too
     time: Scalar  # p t
     repulsion: Scalar  # integral over that time
     missed: Scalar  # sum of the squares of truncation errors [rad^2]
@@ -57,8 +57,8 @@ class Glide(NamedTuple):
 
 
 def settled(stepper: TaylorStepper, state: State, glide: Glide, strongest: Scalar) -> State:
-    """Return the state with the errors that have grown in a glide; `strongest`: bound of the ground acceleration [g].
-    Return the state with the errors that have grown in a glide; `strongest`: bound of the ground acceleration [g]."""
+    """Return the state with the errors that have grown in a glide; `strongest`: bound of the ground acceleration
+    [g]."""
     time = glide.time
     count = (state.steps - glide.steps).astype(time.dtype)
     per_time = 1 / where(time > 0, time, 1.0)  # some pieces have zero length

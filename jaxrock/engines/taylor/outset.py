@@ -1,5 +1,5 @@
-"""Properties of a step from its first terms: initial signs, the start of the search for events, bounds of the velocity.
-Properties of a step from its first terms: initial signs, the start of the search for events, bounds of the velocity."""
+"""Properties of a step from its first terms: initial signs, the start of the search for events, bounds of the
+velocity."""
 
 import jax.numpy as jnp
 from jaxtyping import Array, Inexact

@@ -128,8 +128,8 @@ def _with_reals(states: State, reals: list) -> State:
 
 
 def _changes(values: tuple, by: tuple, changes: tuple) -> tuple[list, list]:
-    """Return the tangents of the last state, and of those before every step: products with the Jacobians of the steps.
-    Return the tangents of the last state, and of those before every step: products with the Jacobians of the steps."""
+    """Return the tangents of the last state, and of those before every step: products with the Jacobians of the
+    steps."""
     (_, reals), (_, told, still, nodes, steps), (first, d_told, *_) = values, by, changes
     first = jnp.stack([jnp.zeros(d.aval.shape, d.aval.dtype) if is_zero(d) else d for d in first])
     numbers, by_numbers = _parted(told[0], d_told[0], jnp.zeros(0, first.dtype))
