@@ -95,7 +95,7 @@ def fit_pulse(
       samples to the whole record, `oscillations` 1.01 to 8, `shape` -30 to 30, phases half a turn either way.
       Parameters of other names must have a range.
     - `of`: compared at all samples: "velocity", as is usual for pulses near faults, or "acceleration".
-    - `starts`: number of descents, from the best points of a grid, each with the delay of its best correlation.
+    - `starts`: number of descents, from the best points of a grid, each with its best-correlated delay.
 
     **Returns:** a `PulseFit`. There may be lower minima that no start leads to.
 

@@ -120,7 +120,7 @@ class Record(Straight):
 
     @property
     def origin(self) -> Origin:
-        """What its file says of it; empty where the name is."""
+        """Metadata that its file states; empty where the name is."""
         return self._told[1]
 
     @property
