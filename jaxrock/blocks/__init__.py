@@ -1,6 +1,6 @@
-"""Bodies that rock: rigid ones, symmetric or not, flexible columns, and the law by which an impact slows them.
+"""Bodies that rock: rigid ones, symmetric or not, flexible columns, and laws of restitution for their impacts.
 
-Imports `numerics`. Start with `rigid`; another law of restitution is a class like those in `restitution`.
+Imports `numerics`. Start with `rigid`. A new law of restitution is a class like those in `restitution`.
 """
 
 from jaxrock._surface import shown as _shown

@@ -1,4 +1,4 @@
-"""Asymmetric blocks: two corners, each with a slenderness, a frequency parameter and a restitution of its own."""
+"""Asymmetric blocks: two corners, each with its own slenderness, frequency parameter and restitution."""
 
 from typing import Annotated, Any
 
@@ -36,14 +36,14 @@ _gyration = Range("be 0 or more and finite, and at most 1e9", 0.0, np.inf, lambd
 
 
 def _law(restitution: Ratios) -> AbstractRestitution:
-    """The law that the restitution of an asymmetric block means."""
+    """Return the law for the argument `restitution` of an asymmetric block."""
     if isinstance(restitution, (tuple, list)):
         return PerSide(*pair("restitution", restitution))
     return law_of(restitution, AngularMomentum())
 
 
 def _as_seen(corner1: Values, corner2: Values, centre: Values) -> tuple[tuple[Real, Real], tuple[Real, Real]]:
-    """Slenderness angles and distances of the centre of mass, from the corners."""
+    """Return slenderness angles, and distances of the centre of mass from the corners."""
     places = {"corner1": corner1, "corner2": corner2, "centre": centre}
     right, left, middle = (strength(name, place) for name, place in places.items())
     for name, place in zip(places, (right, left, middle)):
@@ -60,8 +60,8 @@ def _as_seen(corner1: Values, corner2: Values, centre: Values) -> tuple[tuple[Re
 class AsymmetricBlock(Owner):
     """A free-standing rigid block whose two sides differ: a rock, a statue, a loaded cabinet.
 
-    Side 1 is that of positive rotations, on which it stands on corner 1, the right one; side 2 that of negative
-    rotations. Positive ground acceleration drives negative rotation, as everywhere.
+    Side 1 is that of positive rotations, on which the block stands on corner 1, the right one. Side 2 is that of
+    negative rotations. Positive ground acceleration drives negative rotation, as everywhere.
 
     **Arguments:**
 
@@ -76,8 +76,9 @@ class AsymmetricBlock(Owner):
 
     All may be arrays of one shape, for use under `jax.vmap`.
 
-    **Raises:** ValueError for a value outside its range; where the product of given restitutions, which is the part of
-    its speed that two impacts leave a block, exceeds 1. (One may: about corners of unequal height it often does.)
+    **Raises:** ValueError for a value outside its range; where the product of given restitutions exceeds 1. The product
+    is the part of its speed that a block keeps over two impacts. (One may exceed 1: about corners of unequal height it
+    often does.)
 
     **Source:** Housner (1963) for each side; `jaxrock.restitution.AngularMomentum` for the impact.
     """
@@ -227,9 +228,9 @@ class AsymmetricBlock(Owner):
 
         **Returns:** an `AsymmetricBlock`; about corners of unequal height where `supports` say so.
 
-        **Raises:** ValueError for an outline that crosses itself or has no area; where the block would not stand; where
-        another vertex reaches the level of the ground before the block is in balance on a corner: it would roll onto
-        that face, and not rock about the corner.
+        **Raises:** ValueError for an outline that crosses itself or has no area, and where the block would not stand.
+        Also where another vertex reaches the ground before the block is in balance on a corner: such a block rolls onto
+        that face, and does not rock about the corner.
         """
         shape = Outline.of(outline)
         right, left, middle, gyration = shape.standing(supports, centre, gyration_radius)
@@ -254,13 +255,15 @@ class AsymmetricBlock(Owner):
         gravity: ArrayLike = GRAVITY,
         throw: bool = True,
     ) -> "AsymmetricBlock":
-        """Build the block that a rock is in the vertical plane of an azimuth, from the mesh of its surface.
+        """Build the block of a rock in the vertical plane of an azimuth, from the mesh of its surface.
 
         **Arguments:**
 
-        - `mesh`: a `Rock`, which knows `unit` and `tolerance`, or what `Rock.from_mesh` takes, with these as there.
+        - `mesh`: a `Rock`, which has its own `unit` and `tolerance`; or a mesh for `Rock.from_mesh`, with these as
+          there.
         - `azimuth`: from the first axis towards the second [rad]; its direction is to the right (corner 1).
-        - `base`, `plane`: as in `Rock.section`. Where bases differ they are rounded, and it warns.
+        - `base`, `plane`: as in `Rock.section`. A base for which "narrow" and "wide" differ is rounded: a warning says
+          so.
         - `restitution`, `gravity`: as in `from_radii`.
 
         **Returns:** an `AsymmetricBlock`: rocking in the plane alone, without twisting, rolling sideways, or sliding.
@@ -294,12 +297,12 @@ class AsymmetricBlock(Owner):
     @property
     @one_program
     def restitution2(self) -> Real:
-        """The same for an impact that ends the stay on side 2."""
+        """Angular velocity after an impact that ends the stay on side 2 over that before it."""
         return self.law.ratio(self.corners[1], jnp.zeros_like(self.p1))
 
     @property
     def corners(self) -> tuple[Corners, Corners]:
-        """What the law of restitution sees of impacts that end a stay on side 1, and on side 2."""
+        """The arguments of the law of restitution for impacts that end a stay on side 1, and on side 2."""
         return (
             Corners(self.alpha1, self.alpha2, self.p1, self.inertia_ratio2, 1 / self.radius_ratio, 1),
             Corners(self.alpha2, self.alpha1, self.p2, self.inertia_ratio, self.radius_ratio, -1),
@@ -307,26 +310,26 @@ class AsymmetricBlock(Owner):
 
     @property
     def sides(self) -> tuple[Side, Side]:
-        """What a model sees of side 1 and of side 2."""
+        """The parameters of side 1 and of side 2 for a model."""
         return Side(self.alpha1, self.p1, self.restitution1), Side(self.alpha2, self.p2, self.restitution2)
 
     @property
     def mirrored(self) -> "AsymmetricBlock":
-        """The block seen from behind: its sides exchanged."""
+        """The block seen from behind, its sides exchanged."""
         radii = None if self.given_radius_ratio is None else 1 / self.given_radius_ratio
         return AsymmetricBlock(self.alpha2, self.alpha1, self.p2, self.inertia_ratio2, radii, self.law.mirrored)
 
 
 @one_program
 def _of_radii(first: Real, second: Real, gyration: Real, gravity: Real) -> tuple[Real, Real, Real]:
-    """Frequency parameter and inertia ratio of side 1, and R2/R1."""
+    """Return the frequency parameter and the inertia ratio of side 1, and R2/R1."""
     kappa = first**2 / (first**2 + gyration**2)
     return jnp.sqrt(gravity * kappa / first), kappa, second / first
 
 
 @one_program
 def _of_rates(p1: Real, p2: Real, kappa: Real) -> tuple[Real, Bool[Array, "..."], Real]:
-    """p2 for every block, whether there is such a block, and R2/R1."""
+    """Return p2 of every block, whether such a block exists, and R2/R1."""
     square = (p2 / p1) ** 2
     inner = 1 - 4 * square**2 * kappa * (1 - kappa)
     return jnp.broadcast_to(p2, inner.shape), inner >= 0, (1 + jnp.sqrt(inner)) / (2 * square * kappa)

@@ -1,7 +1,7 @@
-"""The base of a rock in a plane: where its outline touches the ground as it opens to the right, by known numbers.
+"""The base of a rock in a plane: the points at which its outline touches the ground as it opens to the right.
 
-Outlines are points (n, 2) in no order, width outward from the centre of mass and height; the corner is the outermost of
-those on the ground, and the centre of mass has a height.
+Outlines are known points (n, 2), in no order: width outward from the centre of mass, and height. The corner is the
+outermost point on the ground; the centre of mass is given by its height.
 """
 
 import warnings
@@ -11,11 +11,11 @@ import numpy as np
 from jaxrock._precision import frames_of_the_package
 from jaxrock.blocks.edge import Edge, fitted_edge
 
-_SMOOTH = 0.2  # of the longest arm of the weight, by which a smooth edge may differ from the faces of a mesh
+_SMOOTH = 0.2  # share of the longest arm of the weight by which a smooth edge may differ from the faces of a mesh
 
 
 def arms_of(points: np.ndarray, corner: np.ndarray, height: float, opening: np.ndarray) -> np.ndarray:
-    """Width of the lowest point from a corner outward, from the centre of mass, when all has turned to the right."""
+    """Return the horizontal distance from the centre of mass to the lowest point beyond a corner, at opening angles."""
     beyond = np.concatenate([[corner], points[points[:, 0] > corner[0]]]) - [0.0, height]
     found = []
     for sine, cosine in zip(np.sin(opening), np.cos(opening)):  # one by one: a scan has millions of vertices
@@ -25,7 +25,9 @@ def arms_of(points: np.ndarray, corner: np.ndarray, height: float, opening: np.n
 
 
 def rolled(points: np.ndarray, corner: np.ndarray, height: float) -> np.ndarray:
-    """Where it stands when it has rolled to the right until it is in balance: from vertex to vertex of the hull."""
+    """Return the vertex that supports the rock in balance, after it rolled to the right from vertex to vertex of its
+    hull.
+    """
     for _ in range(len(points)):
         beyond = points[points[:, 0] > corner[0] + 1e-9 * np.ptp(points[:, 0])]
         slopes = np.arctan2(beyond[:, 1] - corner[1], beyond[:, 0] - corner[0])
@@ -36,7 +38,7 @@ def rolled(points: np.ndarray, corner: np.ndarray, height: float) -> np.ndarray:
 
 
 def rounded_edge(points: np.ndarray, corner: np.ndarray, height: float, knots: int) -> Edge:
-    """The rounded edge to the right of a corner."""
+    """Fit the rounded edge to the right of a corner."""
     radius, alpha = (
         np.hypot(corner[0], height - corner[1]),
         np.arctan2(corner[0], height - corner[1]),
@@ -59,7 +61,10 @@ def rounded_edge(points: np.ndarray, corner: np.ndarray, height: float, knots: i
 
 
 def _touching(points: np.ndarray, corner: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices that touch the ground one after the other beyond a corner, and the opening angles at which each does."""
+    """Return the vertices that touch the ground in turn beyond a corner, and an opening angle for each.
+
+    The angle is midway between those of the faces on either side, except 0 for the corner.
+    """
     chain, angles = [corner], [0.0]
     while angles[-1] < np.pi / 2:
         beyond = points[points[:, 0] > chain[-1][0] + 1e-9 * np.ptp(points[:, 0])]
@@ -68,7 +73,7 @@ def _touching(points: np.ndarray, corner: np.ndarray) -> tuple[np.ndarray, np.nd
         slopes = np.arctan2(beyond[:, 1] - chain[-1][1], beyond[:, 0] - chain[-1][0])
         chain.append(beyond[slopes.argmin()])
         angles.append(slopes.min())
-    turns = np.append(angles[1:], np.pi / 2)  # of the faces after each
+    turns = np.append(angles[1:], np.pi / 2)  # opening angles of the faces after each vertex
     midway = (np.array(angles) + turns) / 2
     midway[0] = 0.0
     return np.array(chain), midway

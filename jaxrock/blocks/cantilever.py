@@ -11,7 +11,7 @@ from jaxrock._settings import kept_by_precision
 class UnitColumn(NamedTuple):
     """Vibrations of a cantilever of unit length, mass and bending stiffness, clamped at its base.
 
-    A mode's shape has unit modal mass. Column and mode displacements: u = shapes @ q.
+    A mode's shape has unit modal mass. Displacements of column and modes: u = shapes @ q.
     """
 
     frequencies: Float[np.ndarray, " modes"]
@@ -19,19 +19,19 @@ class UnitColumn(NamedTuple):
     rotation: Float[np.ndarray, " modes"]  # y' M shape: the modes of a unit rotation about the base
     translation: Float[np.ndarray, " modes"]  # 1' M shape
     tip: Float[np.ndarray, " modes"]  # the shapes at the top
-    chords: Float[np.ndarray, "elements modes"]  # by how much the elements turn
-    carried: Float[np.ndarray, " elements"]  # moment of the weight that an element carries, per turn of it
-    sway: Float[np.ndarray, "elements elements"]  # masses, as the turning elements feel them
-    buckling: float  # its own weight that a clamped column just bears, over bending stiffness/length^2
+    chords: Float[np.ndarray, "elements modes"]  # rotations of the elements
+    carried: Float[np.ndarray, " elements"]  # moment of the weight above each element, per rotation of the element
+    sway: Float[np.ndarray, "elements elements"]  # mass matrix in the rotations of the elements
+    buckling: float  # critical own weight of a clamped column, over bending stiffness/length^2
 
 
 @kept_by_precision
 def unit_column(masses: int) -> UnitColumn:
-    """The unit column of `masses` lumped masses (its base included) and `masses` - 1 beam elements.
+    """Return the unit column of `masses` lumped masses (its base included) and `masses` - 1 beam elements.
 
-    Each element gives half its mass to either end: the base moment of gravity is exact, and the moment of inertia
-    is 1 + 1/(2 (masses - 1)^2) times the block's. Low modes come from the flexibility, high ones from the
-    stiffness, because rounding hides the ones in the other.
+    Each element gives half its mass to either end: the base moment of gravity is exact, and the moment of inertia is 1
+    + 1/(2 (masses - 1)^2) times the block's. Low modes come from the flexibility matrix, high ones from the stiffness
+    matrix, because rounding drowns the others in each.
     """
     elements = masses - 1
     mass = np.full(elements, 1 / elements)
@@ -58,7 +58,7 @@ def unit_column(masses: int) -> UnitColumn:
 
 
 def _stiffness(elements: int) -> Float[np.ndarray, "nodes nodes"]:
-    """Lateral stiffness of a unit cantilever of Euler-Bernoulli elements, whose nodes rotate freely."""
+    """Return the lateral stiffness of a unit cantilever of Euler-Bernoulli elements, whose nodes rotate freely."""
     n = elements
     matrix = np.zeros((2 * n + 2, 2 * n + 2))
     element = n * np.array(

@@ -1,4 +1,4 @@
-"""Rounded edges: what a block rolls on as it opens, in place of a corner about which it turns."""
+"""Rounded edges, on which a block rolls as it opens, instead of turning about a corner."""
 
 from typing import NamedTuple, cast
 
@@ -20,10 +20,10 @@ Real = Inexact[Array, "..."]
 
 
 class Edge(eqx.Module):
-    """An edge that is rounded: the radius of curvature at the point where the block touches the ground, over R.
+    """A rounded edge: the radius of curvature at the point where the block touches the ground, over R.
 
-    At rest the block stands on the corner where the rounding begins, to which its slenderness and R belong; when it
-    has opened by an angle, it has rolled on by the integral of the radius over that angle.
+    At rest the block stands on the corner where the rounding begins, to which its slenderness and R belong. When it has
+    opened by an angle, it has rolled on by the integral of the radius over that angle.
 
     **Arguments:**
 
@@ -56,30 +56,35 @@ class Edge(eqx.Module):
 
     @one_program
     def at(self, opening: ArrayLike) -> Real:
-        """Radius over R where a block touches the ground that has opened by an angle."""
+        """Return the radius over R at the point of contact of a block that has opened by an angle."""
         return self._rounded(opening).radius
 
     @one_program
     def rise(self, opening: ArrayLike) -> Real:
-        """By how much the centre of mass is higher than over a sharp corner, over R: the integral of
-        sin(x - y) radius(y)."""
+        """Return the rise of the centre of mass over that on a sharp corner, over R: the integral of sin(x - y)
+        radius(y).
+        """
         return self._rounded(opening).rise
 
     @one_program
     def run(self, opening: ArrayLike) -> Real:
-        """By how much the point of contact is farther out than a sharp corner, over R: the integral of
-        cos(x - y) radius(y)."""
+        """Return the distance of the point of contact beyond a sharp corner, over R: the integral of cos(x - y)
+        radius(y).
+        """
         return self._rounded(opening).run
 
     @one_program
     def length(self, opening: ArrayLike) -> Real:
-        """How far it has rolled along the ground, over R: the integral of the radius."""
+        """Return the rolled distance along the ground, over R: the integral of the radius."""
         return self._rounded(opening).length
 
     @called_by_users
     def place(self, opening: ArrayLike) -> tuple[Real, Real]:
-        """Where the edge touches the ground when the block has opened by an angle, from the corner outward and upward
-        on the block as it stands, over R: the integrals of cos(y) radius(y) and sin(y) radius(y)."""
+        """Return the place on the block that touches the ground when the block has opened by an angle, over R.
+
+        It is measured from the corner outward and upward on the block at rest: the integrals of cos(y) radius(y) and
+        sin(y) radius(y).
+        """
         sine, cosine = sine_cosine(jnp.asarray(opening))
         run, rise = self.run(opening), self.rise(opening)
         return cosine * run + sine * rise, sine * run - cosine * rise
@@ -91,7 +96,7 @@ class Edge(eqx.Module):
         return told(opening)
 
     def pieces(self) -> "EdgePieces":
-        """The edge in pieces on which its radius is linear in the opening angle."""
+        """Return the edge in pieces on which its radius is linear in the opening angle."""
         none = jnp.zeros_like(self._first)
         if self.angle is None:
             return EdgePieces(None, Rounded(none, none, none, self.radius), none)
@@ -100,7 +105,7 @@ class Edge(eqx.Module):
         )
         slope = jnp.diff(radius[1:]) / jnp.diff(self.angle)
         slope = jnp.concatenate([none[None], slope, none[None]])
-        # What a piece adds stays the same vector on a block that goes on turning.
+        # The contribution of a piece is a constant vector on the block: it turns with the block.
         added = _added(jnp.diff(start), radius[:-1], slope[:-1])
         sine, cosine = sine_cosine_of_any(start)
         out = jnp.cumsum(cosine[1:] * added.run + sine[1:] * added.rise)
@@ -114,16 +119,19 @@ class Edge(eqx.Module):
         return self.radius if self.angle is None else self.radius[0]
 
     def with_angles(self, angle: Real) -> "Edge":
-        """The same edge by a longer list of angles, whose first are its own."""
+        """Extend the list of angles of an edge without changing the edge; `angle` begins with its own."""
         if self.angle is None:
             return Edge(jnp.broadcast_to(self.radius, angle.shape), angle)
         return Edge(jnp.concatenate([self.radius, jnp.full(angle.size - self.angle.size, self.radius[-1])]), angle)
 
 
 class Rounded(NamedTuple):
-    """What an edge has added when the block has opened by an angle x, over R: by how much the centre of mass is higher
-    (the integral of sin(x - y) radius(y)) and the point of contact farther out (of cos(x - y) radius(y)) than of a
-    sharp corner, how far the block has rolled, and the radius there."""
+    """Contributions of an edge when the block has opened by an angle x, over R.
+
+    - `rise`: rise of the centre of mass over that on a sharp corner, the integral of sin(x - y) radius(y).
+    - `run`: distance of the point of contact beyond a sharp corner, the integral of cos(x - y) radius(y).
+    - `length`: rolled distance; `radius`: at x.
+    """
 
     rise: Real
     run: Real
@@ -144,11 +152,11 @@ class EdgePieces(eqx.Module):
 
     @property
     def edge(self) -> Edge:
-        """The whole."""
+        """The whole edge."""
         return Edge(self.before.radius) if self.start is None else Edge(self.before.radius[1:], self.start[1:])
 
     def at(self, opening: Real) -> Rounded:
-        """What the edge has added at one opening angle."""
+        """Return the contributions of the edge at one opening angle."""
         if self.start is None:
             return _added(opening, self.before.radius, self.slope)
         if self.start.ndim:
@@ -164,8 +172,8 @@ class EdgePieces(eqx.Module):
         )
 
     def ahead(self, opening: Real, outward: Bool[Array, ""]) -> tuple["EdgePieces", Real]:
-        """Return the piece on which a block rolls on from an opening angle, outward or inward, and the angle that ends
-        it.
+        """Return the piece on which a block rolls on from an opening angle, outward or inward, and the angle of its
+        end.
 
         The angle is beyond pi/2 where no piece follows.
         """
@@ -180,7 +188,9 @@ class EdgePieces(eqx.Module):
 
 
 def _added(angle: Real, radius: Real, slope: Real) -> Rounded:
-    """What a piece adds that starts with a radius and a slope of it, when it has turned by an angle."""
+    """Return the contributions of a piece after a turn by an angle, from its initial radius and the slope of the
+    radius.
+    """
     lifted = 2 * sine_cosine(angle / 2)[0] ** 2  # 1 - cos(x)
     return Rounded(
         radius * lifted + slope * angle**3 * sine_lag(angle),  # x - sin(x)
@@ -196,17 +206,17 @@ def _grows(angle):
 
 
 def fitted_edge(opening: Float[np.ndarray, " n"], run: Float[np.ndarray, " n"], knots: int) -> Edge:
-    """The edge that is fitted best to how far out a block touches the ground at every opening angle.
+    """Fit an edge to the outward shift of the point of contact at every opening angle.
 
     **Arguments:**
 
     - `opening`: (n,) angles [rad], from 0 to where the block is in balance.
     - `run`: (n,) as `Edge.run` [-].
-    - `knots`: at how many angles, evenly from 0 to the last, the radius is told.
+    - `knots`: number of angles, evenly from 0 to the last, at which the radius is given.
 
     **Returns:** an `Edge`, by least squares with radii of 0 or more (Lawson & Hanson 1974).
     """
-    import scipy.optimize  # few need it, and it takes long
+    import scipy.optimize  # imported here: few calls need it, and the import takes long
 
     angle = np.linspace(0.0, opening[-1], knots)
     columns = [Edge(np.eye(knots)[k], angle).run(opening) for k in range(knots)]

@@ -22,34 +22,35 @@ _stiff = Range("be positive and finite, from 1e-9 to 1e30", 0.0, math.inf, lambd
 class FlexibleBlock(Owner):
     """A rectangular elastic block that rocks: lumped masses on a cantilever whose base is a rocking spring (mmSM).
 
-    The column of length 2R carries the ground's acceleration times cos(alpha), and its base turns against a moment that
-    falls with its rotation; below M0 = m g R sin(alpha) it is locked. When the rotation returns to zero the velocities
-    of all masses are multiplied by the restitution. With small rotations, "linear" or "plastic", and without P-Delta
-    every phase is linear, and solved exactly; else what is not linear is followed beside the linear part.
+    The column of length 2R carries the ground's acceleration times cos(alpha). Its base turns against a moment that
+    falls with its rotation; below M0 = m g R sin(alpha) the base is locked. When the rotation returns to zero, the
+    velocities of all masses are multiplied by the restitution. With small rotations, "linear" or "plastic", and without
+    P-Delta, every phase is linear and solved exactly. Otherwise the nonlinear terms are integrated beside the linear
+    part.
 
     **Arguments:**
 
     - `width`, `height`: full sizes [m], positive. (The depth does not matter.)
-    - `youngs_modulus`: [Pa], positive; so large that the column does not give way before its base, and at most such
-      that it is 10^12 times as stiff (some 10^18 Pa of 1 m by 5 m: a rigid block to 12 digits). From 10^9 times on, an
-      undamped column may vibrate too long for its greatest bending to be searched: a `Status` then says so.
+    - `youngs_modulus`: [Pa], positive; so large that the column does not give way before its base. At most such that
+      the column is 10^12 times as stiff (some 10^18 Pa for 1 m by 5 m: a rigid block to 12 digits). From 10^9 times on,
+      an undamped column may vibrate too long for the search of its greatest bending: a `Status` then says so.
     - `density`: [kg/m^3], positive.
     - `damping_ratio`: of the column, in [0, 1) [-]; 0 for none.
     - `masses`: number of lumped masses, the one at the base included; 2 to 60. Six are within a few per cent of many.
-    - `restitution`: velocities after an impact over those before it, in [0, 1], or a law of restitution, which sees the
+    - `restitution`: velocities after an impact over those before it, in [0, 1], or a law of restitution, which gets the
       angular velocity of the base; None: Housner's, 1 - 1.5 sin^2(alpha).
     - `damping`: "stiffness": in proportion to the column's stiffness, with `damping_ratio` in its first clamped mode;
       "modal": `damping_ratio` in every clamped mode; "rayleigh": in proportion to stiffness and masses, with
-      `damping_ratio` in the first two clamped modes. The masses' part brakes rigid rocking, too.
-    - `impacts`: which returns of the base to zero count as impacts: "alternate": the first from either side, and later
-      ones from that side that end a longer stay, so that a column that bounces on one edge is not braked twice, and
-      one that trembles as it uplifts is braked when it comes down; "every": all of them.
-    - `base`: moment of the base at the rotation x, less what the weight of the straight column pulls. "sine":
+      `damping_ratio` in the first two clamped modes. The masses' part also damps rigid rocking.
+    - `impacts`: which returns of the base to zero count as impacts. "alternate": the first from either side, and later
+      ones from that side that end a longer stay. A column that bounces on one edge is thus not slowed twice, and one
+      that trembles as it uplifts is slowed when it comes down. "every": all of them.
+    - `base`: moment of the base at the rotation x, less the moment of the straight column's weight. "sine":
       m g R sin(alpha - x), the block's own; "linear": M0 (1 - x/alpha), a constant negative stiffness; "plastic":
       M0 - m g R sin(x), or m g R x with small rotations, so that it balances at alpha, or at sin(alpha).
-    - `rotations`: "small": sines of rotations are rotations, cosines 1; "finite": the elements of the column turn as
-      they are, so that its top moves by cos(alpha) times their sines, and the ground pushes with their cosines.
-    - `p_delta`: whether the weight pulls at the column as it is bent, and not only at its base.
+    - `rotations`: "small": sines of rotations are rotations, cosines 1. "finite": the exact rotations of the column's
+      elements, so that its top moves by cos(alpha) times their sines, and the ground pushes with their cosines.
+    - `p_delta`: whether the weight also acts on the bent column, and not only at its base.
     - `gravity`: [m/s^2], positive.
 
     Numbers may be arrays of one shape, for use under `jax.vmap`; `masses`, words and `p_delta` are one for all.
@@ -107,7 +108,7 @@ class FlexibleBlock(Owner):
         self.law = law_of(restitution, Housner(), symmetric=True)
         self.width = fitting_width(self.law, self.width, self.height)
         for allowed, holds in _DEMANDS:
-            now = holds(self)  # where nothing is raised, of what the demand before has left
+            now = holds(self)  # without errors: the modulus as the previous demand left it
             self.youngs_modulus = checked("youngs_modulus", self.youngs_modulus, allowed, lambda _, now=now: now)
 
     @property
@@ -122,8 +123,11 @@ class FlexibleBlock(Owner):
 
     @property
     def restitution(self) -> Real:
-        """Velocities after an impact over those before it (D&F 2017, 21: Housner's); if that depends on the speed, of
-        the gentlest, and if on the side, of one that ends a stay on side 1."""
+        """Velocities after an impact over those before it (D&F 2017, 21: Housner's).
+
+        If they depend on the speed, this is the ratio of the gentlest impact; if on the side, of one that ends a stay
+        on side 1.
+        """
         return self.law.ratio(self.corners, jnp.zeros_like(self.alpha))
 
     @property
@@ -133,7 +137,7 @@ class FlexibleBlock(Owner):
 
     @property
     def corners(self) -> Corners:
-        """What the law of restitution sees of an impact."""
+        """The arguments of the law of restitution for an impact."""
         return Corners(self.alpha, self.alpha, self.p)
 
     @property
@@ -141,8 +145,8 @@ class FlexibleBlock(Owner):
     def first_period(self) -> Real:
         """First period of the clamped continuous column of the block's height [s].
 
-        The masses stand on one of the length 2R (`length`), whose periods (`frequencies`) are (2R/height)^(3/2) times
-        as long.
+        The masses stand on a column of the length 2R (`length`), whose periods (`frequencies`) are (2R/height)^(3/2)
+        times as long.
 
         **Source:** Diamantopoulos & Fragiadakis (2017), equation 23: 12.38 sqrt(density/modulus) h/tan(alpha), h half
         the height, with 12.38 = 8 sqrt(3) pi/1.87510^2.
@@ -174,7 +178,7 @@ class FlexibleBlock(Owner):
 
     @property
     def spring_rate(self) -> Real:
-        """Negative stiffness of the base where it balances, over m L^2 [1/s^2]."""
+        """Negative stiffness of the base at its balance, over m L^2 [1/s^2]."""
         if self.base == "linear":
             return self.strength / self.alpha
         weight = self.gravity / (2 * self.length)
@@ -207,7 +211,7 @@ class FlexibleBlock(Owner):
         return part * first * second, part[..., None] * frequencies**2
 
 
-# What the stiffness of a column must do, and whether that of a block does.
+# Each demand on the stiffness of a column: words for the message, and a test of a block.
 _DEMANDS: tuple[tuple[str, Callable], ...] = (
     (
         "make the column stiffer than its base is unstable",
@@ -230,8 +234,7 @@ def _bears_itself(block: FlexibleBlock) -> Bool[Array, "..."]:
 
 
 def is_possible(block: FlexibleBlock) -> Bool[Array, ""]:
-    """Return whether the constructor takes such numbers: a step of an optimiser may have changed those of a block as it
-    is."""
+    """Return whether the constructor would accept the block, whose numbers a step of an optimiser may have changed."""
     known = [leaf for leaf in leaves_of(block) if leaf.declared.axes is not None]
     held = [leaf.declared.range.holds(leaf.value) for leaf in known]
     held += [fits(block.law, block.width, block.height), *(holds(block) for _, holds in _DEMANDS)]

@@ -1,4 +1,4 @@
-"""Meshes of surfaces, which trimesh reads and integrates; it is asked for when one is read."""
+"""Surface meshes, which trimesh reads and integrates; trimesh is imported only when a file is read."""
 
 import os
 from typing import Any
@@ -9,14 +9,14 @@ from jaxrock._regular_files import open_regular
 
 
 def surface_of(mesh: Any) -> Any:
-    """A mesh of trimesh."""
+    """Return a trimesh mesh from a mesh or the path of a file."""
     if isinstance(mesh, (str, os.PathLike)):
         path = path_of("mesh", mesh)
         try:
             import trimesh
         except ImportError as error:
             raise ImportError('Reading a mesh needs trimesh: pip install "jaxrock[mesh]".') from error
-        with open_regular(path):  # fails with the same errors as for any other file
+        with open_regular(path):  # raises the same errors as for any other file
             pass
         try:
             return trimesh.load(path, force="mesh")

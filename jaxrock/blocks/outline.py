@@ -1,4 +1,4 @@
-"""The outline of a block as a polygon: area, centre of mass, inertia, the corners on which it stands."""
+"""The outline of a block as a polygon: its area, centre of mass, inertia, and the corners on which it stands."""
 
 from typing import NamedTuple
 
@@ -8,7 +8,7 @@ from jaxrock._checks import Values, check_known, strength, whole
 
 
 class Outline(NamedTuple):
-    """A polygon of even thickness and density; lengths in m. Known numbers: it is not for use under jit."""
+    """A polygon of even thickness and density; lengths in m. For known numbers only: not for use under jit."""
 
     vertices: np.ndarray  # (n, 2), counterclockwise
     order: np.ndarray  # (n,) position of each vertex in the outline as given
@@ -44,18 +44,18 @@ class Outline(NamedTuple):
         return cls(given, order, area, centre + given[0], float(np.sqrt(second / area)))
 
     def at(self, position: int) -> np.ndarray:
-        """Vertex at a position in the outline as given."""
+        """Return the vertex at a position in the outline as given."""
         position = whole("supports", position, -len(self.order), len(self.order) - 1)
         return self.vertices[np.flatnonzero(self.order == position % len(self.order))[0]]
 
     def standing(self, supports, centre, gyration_radius) -> tuple:
-        """Right and left corner, centre of mass and radius of gyration: given, or the outline's own."""
+        """Return the right and left corner, centre of mass and radius of gyration: given, or the outline's own."""
         right, left = self.flat_base() if supports is None else (self.at(position) for position in supports)
         centre = self.centre if centre is None else centre
         return right, left, centre, self.gyration_radius if gyration_radius is None else gyration_radius
 
     def flat_base(self) -> tuple[np.ndarray, np.ndarray]:
-        """Right and left corner: the outermost of the lowest vertices."""
+        """Return the right and left corner: the outermost of the lowest vertices."""
         height = self.vertices[:, 1]
         lowest = self.vertices[height <= height.min() + 1e-9 * np.ptp(height)]
         right, left = lowest[lowest[:, 0].argmax()], lowest[lowest[:, 0].argmin()]
@@ -78,7 +78,7 @@ class Outline(NamedTuple):
 
 def _check_simple(vertices: np.ndarray) -> None:
     """Raise ValueError where two edges that are not neighbours cross or touch."""
-    number = np.flatnonzero((vertices != np.roll(vertices, -1, axis=0)).any(axis=1))  # of edges that have a length
+    number = np.flatnonzero((vertices != np.roll(vertices, -1, axis=0)).any(axis=1))  # edges of positive length
     start = vertices[number]
     end, n = np.roll(start, -1, axis=0), len(start)
 
@@ -93,7 +93,7 @@ def _check_simple(vertices: np.ndarray) -> None:
     apart = turn(start[i], end[i], start[j]) * turn(start[i], end[i], end[j])
     across = turn(start[j], end[j], start[i]) * turn(start[j], end[j], end[i])
     low, high = np.minimum(start, end), np.maximum(start, end)
-    near = ((low[i] <= high[j]) & (low[j] <= high[i])).all(axis=1)  # which tells of edges on one line
+    near = ((low[i] <= high[j]) & (low[j] <= high[i])).all(axis=1)  # decides for collinear edges
     meeting = near & (apart <= 0) & (across <= 0)
     if meeting.any():
         first, second = (number[each[meeting]][0] for each in (i, j))

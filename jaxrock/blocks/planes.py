@@ -1,4 +1,4 @@
-"""Vertical planes in which rocks are weak, and the one that many of them share."""
+"""Vertical planes in which rocks are weak, and the plane that most of them share."""
 
 from collections.abc import Sequence
 from typing import Annotated, NamedTuple
@@ -12,11 +12,11 @@ from jaxrock.blocks.rock import Rock
 
 
 class WeakPlane(NamedTuple):
-    """The vertical plane that most rocks share as one in which they are weak.
+    """The vertical plane in which most rocks are weak.
 
     - `azimuth`: of that plane, in [0, pi) [rad].
     - `rocks`: (rocks,) which of them are weak in it.
-    - `azimuths`: (azimuths,) of the planes that were looked at [rad].
+    - `azimuths`: (azimuths,) of the planes that were tried [rad].
     - `slenderness`: (rocks, azimuths) in each, towards the weaker side [rad].
     """
 
@@ -37,17 +37,17 @@ def shared_plane(
     excess: ArrayLike = 0.1,
     planes: Annotated[int, at_least(2, 3600)] = 180,
 ) -> WeakPlane:
-    """The vertical plane in which most of some rocks are about as weak as in any.
+    """Find the vertical plane in which most of some rocks are about as weak as in any.
 
-    Which way the ground moved most is seldom known; rocks of a site that all are weak in one plane say most about
-    shaking in it, and a motion in two components is read in it first.
+    The direction of the strongest shaking is seldom known. Rocks of a site that all are weak in one plane constrain the
+    shaking in that plane best, so a motion in two components is examined there first.
 
     **Arguments:**
 
     - `rocks`: `Rock`s whose meshes are turned alike.
     - `excess`: a rock is weak in a plane in which its slenderness, towards the weaker side, is at most 1 + `excess` of
       that in its weakest plane [-], 0 or more.
-    - `planes`: how many are looked at, evenly over half a turn.
+    - `planes`: number of planes that are tried, evenly over half a turn.
 
     **Returns:** a `WeakPlane`; of several that as many share, that of the least mean logarithm of slenderness.
 

@@ -1,4 +1,4 @@
-"""Blocks whose parameters are uncertain, as random draws."""
+"""Random draws of blocks whose parameters are uncertain."""
 
 import functools
 from typing import Annotated, Any, overload
@@ -43,16 +43,16 @@ def draw_blocks(
     restitution: Annotated[float, _deviation] = 0.0,
     seed: Annotated[int, at_least(0, 2**32 - 1)] = 0,
 ) -> Block | AsymmetricBlock:
-    """Blocks whose parameters are uncertain, as random draws.
+    """Draw random blocks whose parameters are uncertain.
 
     **Arguments:**
 
     - `block`: medians of slenderness and frequency parameter, mean of the restitution.
-    - `draws`: how many.
+    - `draws`: number of blocks.
     - `alpha`, `p`: standard deviations of their logarithms [-], 0 or more; both sides of an `AsymmetricBlock` are drawn
       by the same factor.
-    - `restitution`: standard deviation [-] of a normal distribution that is cut off at 0 and 1; at 0 restitution
-      stays, and follows alpha if it is Housner's, or told by angular momentum. It is 0 for an `AsymmetricBlock`.
+    - `restitution`: standard deviation [-] of a normal distribution that is cut off at 0 and 1. With 0 the block's law
+      stays: a restitution by Housner or by angular momentum follows alpha. It must be 0 for an `AsymmetricBlock`.
     - `seed`: of the random numbers.
 
     **Returns:** a block of the same kind with parameters of shape (draws,).
@@ -73,13 +73,13 @@ def draw_blocks(
 
 @functools.partial(jax.jit, static_argnames="draws")
 def _factors(key: Array, alpha: ArrayLike, p: ArrayLike, draws: int) -> tuple[Array, Array, Array]:
-    """Of slenderness and of frequency parameters, and a key for more."""
+    """Return random factors of the slenderness and of the frequency parameter, and a key for more."""
     *keys, last = jax.random.split(key, 3)
     return *(jnp.exp(by * jax.random.normal(key, (draws,))) for key, by in zip(keys, (alpha, p))), last
 
 
 class _NoBlock(ValueError):
-    """Some draw is outside of its range."""
+    """A draw is outside of its range."""
 
 
 def _made(kind: type, *parameters) -> Any:
@@ -90,7 +90,7 @@ def _made(kind: type, *parameters) -> Any:
 
 
 def _drawn(block: Block, alpha: Array, p: Array, restitution: float, key: Array) -> Block:
-    """Blocks whose slenderness and frequency parameter are times these factors."""
+    """Multiply the slenderness and the frequency parameter of a block by these factors."""
     if restitution != 0 and block.law.depends_on_speed:
         raise ValueError("Argument `restitution` must be 0 for a block whose law of restitution depends on the speed.")
     if restitution != 0 and tells_sides(block.law, block.corners):
@@ -129,20 +129,20 @@ def draw_rocks(
     resolution: Annotated[float, _deviation] = 0.0,
     seed: Annotated[int, at_least(0, 2**32 - 1)] = 0,
 ) -> AsymmetricBlock:
-    """The blocks that a rock may be in a vertical plane, as far as its mesh tells what it stands on.
+    """Draw the blocks that a rock may be in a vertical plane, given the uncertain points of its mesh on the ground.
 
     **Arguments:**
 
     - `rock`: a `Rock`.
     - `azimuth`: as in `Rock.section`; the base is narrow.
-    - `draws`: how many.
+    - `draws`: number of blocks.
     - `tolerance`: least and largest of the height up to which vertices stand on the ground [m], positive: one is drawn
       for each block, evenly in its logarithm.
     - `resolution`: standard deviation of the heights of the vertices [m], 0 or more: noise of scan or photographs.
     - `seed`: of the random numbers.
 
-    **Returns:** an `AsymmetricBlock` with parameters of shape (draws,). What would not stand is drawn again: the rock
-    does.
+    **Returns:** an `AsymmetricBlock` with parameters of shape (draws,). A block that would not stand is drawn again, as
+    the rock does stand.
 
     **Raises:** ValueError for arguments outside their ranges; where fewer than one in a hundred stands.
     """

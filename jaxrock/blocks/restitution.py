@@ -1,8 +1,8 @@
 """Laws of restitution: how an impact slows a block.
 
-A law tells the ratio of the angular velocity after an impact to that before it. All that happens at an impact follows
-from it: the rebound, its derivatives, the energy that is left, and how errors grow. So another law is one class, here
-or in a file of yours:
+A law gives the ratio of the angular velocity after an impact to that before it. All effects of an impact follow from
+the ratio: the rebound, its derivatives, the remaining energy, and the growth of errors. A new law is therefore one
+class, here or in a file of yours:
 
     class Brittle(rk.restitution.AbstractRestitution):
         firm: jax.Array
@@ -44,13 +44,13 @@ ratio_of_inertia = Range("be in (0, 1], and not below 1e-6", 0.0, 1.0, lambda x:
 
 
 class Corners(NamedTuple):
-    """What a law may know of a block: the corner that it leaves at an impact, and the one that it comes to.
+    """The parameters of a block at an impact, for a law: of the corner that it leaves, and of the one that it comes to.
 
     - `alpha`, `next_alpha`: slenderness angles at the one and at the other [rad].
     - `p`: frequency parameter about the corner that it leaves [rad/s].
     - `inertia_ratio`: m R^2/I about the corner that it comes to [-]; 3/4 for a rectangle.
     - `radius_ratio`: distance of the centre of mass from the corner that it leaves, over that from the other [-].
-    - `side`: 1 or -1, the side of which the impact ends a stay; of a law that depends on the speed it may be traced:
+    - `side`: 1 or -1, the side on which the impact ends a stay. For a law that depends on the speed it may be traced:
       `jnp.where(corners.side < 0, ...)`.
     """
 
@@ -63,7 +63,7 @@ class Corners(NamedTuple):
 
 
 class AbstractRestitution(Owner):
-    """A law of restitution. Its fields are parameters, such as derivatives are taken by."""
+    """A law of restitution. Its fields are parameters: derivatives by them exist."""
 
     __repr__ = described
 
@@ -80,7 +80,7 @@ class AbstractRestitution(Owner):
 
     @abc.abstractmethod
     def ratio(self, corners: Corners, speed: Real) -> Real:
-        """Angular velocity after an impact over that before it.
+        """Return the angular velocity after an impact over that before it.
 
         **Arguments:**
 
@@ -88,7 +88,7 @@ class AbstractRestitution(Owner):
         - `speed`: |angular velocity| just before it [rad/s], 0 or more.
 
         **Returns:** the ratio, smooth in the speed, in [0, 1]: a response with any other has the status `not_finite`.
-        Of an asymmetric block one that does not depend on the speed may exceed 1.
+        For an asymmetric block, a ratio that does not depend on the speed may exceed 1.
         """
 
     @property
@@ -98,16 +98,16 @@ class AbstractRestitution(Owner):
 
     @property
     def mirrored(self) -> "AbstractRestitution":
-        """The law of the block seen from behind: its sides exchanged. Another one where the law itself knows sides."""
+        """The law for the block seen from behind, its sides exchanged; a law that tells sides apart overrides it."""
         return self
 
     def most(self, corners: Corners, speed: Real) -> Real:
-        """An upper bound of the ratio of all impacts up to a speed; as it stands, of a law that rises or falls."""
+        """Return an upper bound of the ratio of all impacts up to a speed; the default is right for a monotonic law."""
         return jnp.maximum(self.ratio(corners, jnp.zeros_like(speed)), self.ratio(corners, speed))
 
 
 class Constant(AbstractRestitution):
-    """The same ratio at every impact.
+    """A constant ratio, at every impact.
 
     **Arguments:**
 
@@ -123,12 +123,12 @@ class Constant(AbstractRestitution):
         set_parameters(self, value=value)
 
     def ratio(self, corners: Corners, speed: Real) -> Real:
-        """The value."""
+        """Return the value."""
         return self.value
 
     @property
     def depends_on_speed(self) -> bool:
-        """It does not."""
+        """False: the ratio is constant."""
         return False
 
 
@@ -152,7 +152,7 @@ class Housner(AbstractRestitution):
         self.inertia_ratio = None if inertia_ratio is None else ratio_of_inertia("inertia_ratio", inertia_ratio)
 
     def ratio(self, corners: Corners, speed: Real) -> Real:
-        """It follows alpha, under differentiation too."""
+        """Return the ratio, which follows alpha, also under differentiation."""
         return jnp.maximum(1 - self._loss * jnp.sin(corners.alpha) ** 2, 0)  # Housner 1963; D&D 2012, 2.4
 
     @property
@@ -161,38 +161,39 @@ class Housner(AbstractRestitution):
 
     @property
     def depends_on_speed(self) -> bool:
-        """It does not."""
+        """False: the ratio follows from the shape."""
         return False
 
 
 class AngularMomentum(AbstractRestitution):
     """The impact of any block that keeps its angular momentum about the new corner, at least 0.
 
-    From corner s to corner t: 1 - kappa_t [1 - (R_s/R_t) cos(alpha_s + alpha_t)], kappa_t = m R_t^2/I_t; Housner's for
-    a rectangle, as which a `Block` is taken.
+    From corner s to corner t: 1 - kappa_t [1 - (R_s/R_t) cos(alpha_s + alpha_t)], kappa_t = m R_t^2/I_t. This is
+    Housner's ratio for a rectangle; a `Block` counts as one.
     """
 
     def ratio(self, corners: Corners, speed: Real) -> Real:
-        """It follows the block's shape."""
+        """Return the ratio, which follows the block's shape."""
         (sine, cosine), (next_sine, next_cosine) = sine_cosine(corners.alpha), sine_cosine(corners.next_alpha)
         of_sum = cosine * next_cosine - sine * next_sine  # cos(alpha_s + alpha_t)
         return jnp.maximum(1 - corners.inertia_ratio * (1 - corners.radius_ratio * of_sum), 0)
 
     @property
     def depends_on_speed(self) -> bool:
-        """It does not."""
+        """False: the ratio follows from the shape."""
         return False
 
 
 class PerSide(AbstractRestitution):
-    """A ratio of its own for the impacts that end the stays on either side of a block.
+    """A separate ratio for the impacts that end the stays on either side of a block.
 
     **Arguments:**
 
     - `first`, `second`: the ratio at the end of a stay on side 1 (rotation > 0), and on side 2, 0 or more.
 
-    **Raises:** ValueError where their product, which is the part of its speed that two impacts leave a block, exceeds
-    1. (One of them may: about corners of unequal height it often does. On a symmetric block neither may.)
+    **Raises:** ValueError where their product exceeds 1: it is the part of its speed that a block keeps over two
+    impacts. (One of them may exceed 1: about corners of unequal height it often does. On a symmetric block neither
+    may.)
     """
 
     first: Real = parameter("-", not_negative, symbol="e1", argument="restitution")
@@ -209,17 +210,17 @@ class PerSide(AbstractRestitution):
         self.first = where(jnp.isnan(product), product, self.first)
 
     def ratio(self, corners: Corners, speed: Real) -> Real:
-        """That of the side."""
+        """Return the ratio of the side."""
         return self.second if corners.side < 0 else self.first
 
     @property
     def mirrored(self) -> "PerSide":
-        """The ratios exchanged."""
+        """The law with the ratios exchanged."""
         return PerSide(self.second, self.first)
 
     @property
     def depends_on_speed(self) -> bool:
-        """It does not."""
+        """False: the ratio depends on the side alone."""
         return False
 
 
@@ -245,21 +246,21 @@ class SpeedDependent(AbstractRestitution):
         set_parameters(self, gentle=gentle, violent=violent, scale=scale)
 
     def ratio(self, corners: Corners, speed: Real) -> Real:
-        """Between `gentle` and `violent`."""
+        """Return a ratio between `gentle` and `violent`."""
         return self.violent + (self.gentle - self.violent) * jnp.exp(-speed / self.scale)
 
 
 Restitution = ArrayLike | AbstractRestitution
-_ALIKE = (Constant, Housner, AngularMomentum, SpeedDependent)  # laws that do not ask for the side
+_ALIKE = (Constant, Housner, AngularMomentum, SpeedDependent)  # laws that ignore the side
 
 
 def on_sides(law: AbstractRestitution, corners: Corners) -> tuple[Corners, Corners]:
-    """What a law sees of a symmetric block on side 1, and on side 2; the same object where it does not ask."""
+    """Return a symmetric block's `Corners` for side 1 and side 2; the same object where the law ignores the side."""
     return (corners, corners._replace(side=-1)) if tells_sides(law, corners) else (corners, corners)
 
 
 def tells_sides(law: AbstractRestitution, corners: Corners) -> bool:
-    """Return whether the ratio depends on the side: whether its programs on either side are two."""
+    """Return whether the ratio depends on the side: whether its jaxprs on the two sides differ."""
     if type(law) in _ALIKE:
         return False
     arrays, others = eqx.partition((law, corners), eqx.is_array)
@@ -279,7 +280,7 @@ def tells_sides(law: AbstractRestitution, corners: Corners) -> bool:
 
 
 def _arrays_within(program: Any) -> Iterator:
-    """The arrays in a program, whose text does not show them, and in those of the functions that it calls."""
+    """Yield the constant arrays of a jaxpr, which its text does not show, and of the jaxprs that it calls."""
     yield from getattr(program, "consts", ())
     for equation in program.eqns:
         for part in jax.tree.leaves(equation.params):
@@ -290,17 +291,17 @@ def _arrays_within(program: Any) -> Iterator:
 def law_of(
     restitution: Restitution | None, otherwise: AbstractRestitution, symmetric: bool = False
 ) -> AbstractRestitution:
-    """The law that an argument `restitution` means: itself, that of a number, or, for None, the usual one."""
+    """Return the law for an argument `restitution`: itself, a constant one for a number, or, for None, `otherwise`."""
     if restitution is None:
         return otherwise
-    if symmetric and isinstance(restitution, PerSide):  # corners of one height: no impact is faster than it came
+    if symmetric and isinstance(restitution, PerSide):  # corners of one height: no impact gains speed
         both = share("restitution[0]", restitution.first), share("restitution[1]", restitution.second)
         return eqx.tree_at(lambda law: (law.first, law.second), restitution, both)
     return restitution if isinstance(restitution, AbstractRestitution) else Constant(restitution)
 
 
 def fitting_alpha(law: AbstractRestitution, alpha: Real) -> Real:
-    """The slenderness angle, where the law is one for such blocks."""
+    """Return the slenderness angle, after a check that the law is valid for it."""
     if not isinstance(law, Housner):
         return alpha
     if law.inertia_ratio is None:
@@ -313,7 +314,7 @@ def fitting_alpha(law: AbstractRestitution, alpha: Real) -> Real:
 
 
 def fitting_width(law: AbstractRestitution, width: Real, height: Real) -> Real:
-    """The width of a rectangle, where the law is one for such blocks."""
+    """Return the width of a rectangle, after a check that the law is valid for it."""
     if not isinstance(law, Housner):
         return width
     reason = "Housner's value is negative above"
@@ -324,7 +325,7 @@ def fitting_width(law: AbstractRestitution, width: Real, height: Real) -> Real:
 
 
 def fits(law: AbstractRestitution, width: ArrayLike, height: Real) -> ArrayLike:
-    """Return whether the law has a value for rectangles so wide."""
+    """Return whether the law is valid for rectangles of this width."""
     if not isinstance(law, Housner):
         return True
     width, height, loss = map(if_traced, (width, height, law._loss))
@@ -332,9 +333,9 @@ def fits(law: AbstractRestitution, width: ArrayLike, height: Real) -> ArrayLike:
 
 
 class Reset(eqx.Module):
-    """A law at the impacts that end a block's stays on one corner; speeds are per p t, as in the engines.
+    """A law bound to the impacts that end a block's stays on one corner; speeds are per p t, as in the engines.
 
-    Of a law that does not depend on the speed only its number is left.
+    A law that does not depend on the speed is reduced to its number.
     """
 
     law: AbstractRestitution
@@ -343,13 +344,13 @@ class Reset(eqx.Module):
 
     @classmethod
     def of(cls, law: AbstractRestitution, corners: Corners, p: Real, most: float = np.inf) -> "Reset":
-        """Bind a law to a corner, whose ratio is `most` at most if it does not depend on the speed."""
+        """Bind a law to a corner; a ratio that does not depend on the speed is NaN above `most`."""
         if law.depends_on_speed:
             return cls(law, corners, p)
         ratio = law.ratio(corners, jnp.zeros_like(p))
-        # Of the laws of the package, too: a step of an optimiser may have changed what a constructor has checked.
+        # Checked for the package's own laws, too: an optimiser's step may leave the range that the constructor checked.
         ratio = where((ratio >= 0) & (ratio <= most), ratio, jnp.nan)
-        # As it is: of two corners of unequal height the ratio at one may exceed 1.
+        # Set without the check of `Constant`: with corners of unequal height the ratio at one may exceed 1.
         return cls(eqx.tree_at(lambda c: c.value, Constant(0.0), ratio), None, None)
 
     @property
@@ -359,24 +360,24 @@ class Reset(eqx.Module):
 
     @property
     def depends_on_speed(self) -> bool:
-        """Return whether the ratio does."""
+        """True if the ratio depends on the speed of the impact."""
         return self.law.depends_on_speed
 
     def ratio(self, speed: Real) -> Real:
-        """Speed after over speed before an impact; not a number where a law gives what is none."""
+        """Return the speed after an impact over that before it; NaN where a law gives a ratio outside [0, 1]."""
         if self.corners is None or self.p is None:
             return self._number
         ratio = self.law.ratio(self.corners, speed * self.p)
         return where((ratio >= 0) & (ratio <= 1), ratio, jnp.nan)
 
     def slope(self, speed: Real) -> Real:
-        """How the speed after an impact changes with that before it."""
+        """Return the derivative of the speed after an impact by that before it."""
         if not self.depends_on_speed:
             return self._number
         return jax.jvp(lambda v: v * self.ratio(v), (speed,), (jnp.ones_like(speed),))[1]
 
     def most(self, speed: Real) -> Real:
-        """An upper bound of the ratio of all impacts up to a speed."""
+        """Return an upper bound of the ratio of all impacts up to a speed."""
         if self.corners is None or self.p is None:
             return self._number
         return self.law.most(self.corners, speed * self.p)

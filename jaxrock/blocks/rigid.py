@@ -122,24 +122,27 @@ class Block(Owner):
     @property
     @one_program
     def restitution(self) -> Inexact[Array, "..."]:
-        """Angular velocity after an impact over that before it; if it depends on the speed, of the gentlest, and if on
-        the side, of one that ends a stay on side 1."""
+        """Angular velocity after an impact over that before it.
+
+        If it depends on the speed, this is the ratio of the gentlest impact; if on the side, of one that ends a stay on
+        side 1.
+        """
         return self.law.ratio(self.corners, jnp.zeros_like(self.p))
 
     @property
     def corners(self) -> Corners:
-        """What the law of restitution sees of an impact."""
+        """The arguments of the law of restitution for an impact."""
         return Corners(self.alpha, self.alpha, self.p)
 
     @property
     def half_diagonal(self) -> Inexact[Array, "..."]:
-        """Distance from pivot to centre of mass of the rectangle of this p under 9.81 m/s^2 [m]."""
+        """Distance from pivot to centre of mass of the rectangle with this p under 9.81 m/s^2 [m]."""
         return 3 * GRAVITY / (4 * self.p**2)
 
 
 @one_program
 def _of_rectangle(width: Inexact[Array, "..."], height: Inexact[Array, "..."]) -> tuple[Array, Array]:
-    """Slenderness angle, and half the diagonal."""
+    """Return the slenderness angle, and half the diagonal."""
     return jnp.arctan2(width, height), jnp.hypot(width, height) / 2
 
 
@@ -149,7 +152,7 @@ def _rate_of_rectangle(gravity: Inexact[Array, "..."], radius: Inexact[Array, ".
 
 
 class Side(eqx.Module):
-    """One side of an asymmetric block, as a model sees it: like a `Block`, but its restitution may exceed 1."""
+    """One side of an asymmetric block, for a model: like a `Block`, but its restitution may exceed 1."""
 
     alpha: Inexact[Array, "..."]
     p: Inexact[Array, "..."]

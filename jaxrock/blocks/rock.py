@@ -1,6 +1,6 @@
 """A rock from the mesh of its surface: volume, mass, the ground it stands on, and its plane section in any direction.
 
-Known numbers only, in NumPy.
+For known numbers only, in NumPy.
 """
 
 import warnings
@@ -20,7 +20,7 @@ from jaxrock.blocks.section import Section, section_of_slab
 from jaxrock.blocks.slab import Slab
 
 _PLANES = ("projection", "cut")
-_SHARE = 0.01  # of the height, within which vertices stand on the ground
+_SHARE = 0.01  # share of the height within which vertices stand on the ground
 
 
 class Rock(NamedTuple):
@@ -51,8 +51,8 @@ class Rock(NamedTuple):
         - `mesh`: a `trimesh.Trimesh`, or the path of a file that trimesh reads (STL, PLY, OBJ, ...); its third axis
           points up, and it stands as it does in the field. Needs `pip install "jaxrock[mesh]"`.
         - `unit`: of its coordinates: "m", "cm" or "mm".
-        - `tolerance`: vertices up to so much above the lowest stand on the ground [m], positive; None: a hundredth of
-          the height. As good as the mesh is: too small a one leaves a rock on a needle.
+        - `tolerance`: vertices up to this height above the lowest stand on the ground [m], positive; None: a hundredth
+          of the height. Choose the error of the mesh: a smaller tolerance may leave a rock on a needle.
 
         **Returns:** a `Rock`.
 
@@ -90,19 +90,19 @@ class Rock(NamedTuple):
         base: Annotated[str, word_of("narrow", "wide")] = "narrow",
         plane: Annotated[str, word_of(*_PLANES)] = "projection",
     ) -> Section:
-        """The rock as it rocks in the plane of an azimuth.
+        """Return the section of the rock that rocks in the plane of an azimuth.
 
         **Arguments:**
 
         - `azimuth`: from the first axis towards the second [rad]; its direction is to the right.
-        - `base`: of a rounded base. "narrow": it rocks about the outermost points on the ground, and no vertex beyond
-          is in the way. "wide": about those to which it has rolled when it is in balance. The moment that rights a rock
-          which stands on its base and then rolls lies between those of the two at every rotation. So the two bound how
-          it resists; that one topples and it does not is still possible, because toppling is not ordered. For a flat
-          base both are the same.
-        - `plane`: "projection": of all vertices to the plane, with the rock's own mass and inertia: what rocks about an
-          axis across it. "cut": the slab of even thickness that the plane through the centre of mass cuts out, with
-          the slab's own centre, inertia and ground: a rock as a photograph or an outline tells it.
+        - `base`: of a rounded base. "narrow": the rock rocks about the outermost points on the ground, and vertices
+          beyond are ignored. "wide": about the points to which it has rolled when it is in balance. The righting moment
+          of a rock that stands on its base and then rolls lies between those of the two at every rotation. So the two
+          bound its resistance. They do not bound its overturning, because toppling is not ordered: that one topples and
+          it does not is still possible. For a flat base both are the same.
+        - `plane`: "projection": of all vertices to the plane, with the rock's own mass and inertia, for rocking about
+          an axis across it. "cut": the slab of even thickness that the plane through the centre of mass cuts out, with
+          the slab's own centre, inertia and ground, as from a photograph or an outline.
 
         **Returns:** a `Section`.
 
@@ -119,7 +119,8 @@ class Rock(NamedTuple):
     def arms(
         self, azimuth: ArrayLike, opening: Values, plane: Annotated[str, word_of(*_PLANES)] = "projection"
     ) -> Float[np.ndarray, "2 openings"]:
-        """How far out it touches the ground, from its centre of mass, when it has opened on its base by an angle.
+        """Return the distance from the centre of mass out to the point of contact, for a rock opened on its base by an
+        angle.
 
         **Arguments:**
 
@@ -127,7 +128,7 @@ class Rock(NamedTuple):
         - `opening`: (openings,) opening angles [rad].
 
         **Returns:** (2, openings) distances along the ground to the right and to the left [m]: the arm of the weight,
-        which rights it where it is positive.
+        which rights the rock where it is positive.
 
         **Raises:** ValueError for arguments that are not finite, or of another shape.
         """
@@ -145,17 +146,18 @@ class Rock(NamedTuple):
         knots: Annotated[int, at_least(2, 64)] = 8,
         plane: Annotated[str, word_of(*_PLANES)] = "projection",
     ) -> tuple[Edge, Edge]:
-        """The rounded edges on which it rolls to the right and to the left, for `jaxrock.models.Rolling`.
+        """Fit the rounded edges on which the rock rolls to the right and to the left, for `jaxrock.models.Rolling`.
 
         **Arguments:**
 
         - `azimuth`, `plane`: as in `section`.
-        - `knots`: at how many opening angles, from 0 to its balance, the radius of curvature is told.
+        - `knots`: number of opening angles, from 0 to its balance, at which the radius of curvature is given.
 
-        **Returns:** a pair of `Edge`: those whose points of contact are nearest to the vertices, by least squares; each
-        is taken to touch the ground midway between the faces next to it. Of a side that does not roll, a sharp one. It
-        warns where the arm of the weight differs from that of the mesh (`arms`) by more than a fifth of the longest:
-        such a base is made of faces, on which a rock does not roll smoothly.
+        **Returns:** a pair of `Edge` whose points of contact are nearest to the vertices, by least squares. Each vertex
+        is taken to touch the ground midway between the faces next to it. A side that does not roll gets a sharp edge.
+
+        A warning says where the arm of the weight differs from that of the mesh (`arms`) by more than a fifth of the
+        longest: such a base is made of faces, on which a rock does not roll smoothly.
 
         **Raises:** ValueError for arguments outside their ranges.
         """
@@ -169,7 +171,9 @@ class Rock(NamedTuple):
 
     @arguments
     def slenderness(self, azimuth: Values) -> Float[np.ndarray, "azimuths"]:
-        """Angle of the centre of mass over the point on which it rocks towards each azimuth [rad], (azimuths,)."""
+        """Return the angle of the centre of mass over the point on which it rocks towards each azimuth [rad],
+        (azimuths,).
+        """
         azimuths = np.asarray(direction("azimuth", azimuth), float)
         if azimuths.ndim != 1:
             raise ValueError(f"Argument `azimuth` must be a list, but has shape {azimuths.shape}.")
@@ -177,14 +181,16 @@ class Rock(NamedTuple):
 
     @arguments
     def widths(self, azimuth: ArrayLike) -> Float[np.ndarray, " n"]:
-        """How far all vertices lie in the direction of an azimuth from the centre of mass [m]."""
+        """Return the distances of all vertices from the centre of mass in the direction of an azimuth [m]."""
         return self._widths(float(scalar("azimuth", direction("azimuth", azimuth))))
 
     def _widths(self, azimuth: float) -> Float[np.ndarray, " n"]:
         return (self.vertices - self.centre)[:, :2] @ _towards(azimuth)
 
     def _seen(self, azimuth: ArrayLike, plane: str) -> tuple[Section, Float[np.ndarray, "n 2"]]:
-        """The section by the points on the ground alone; width, from the centre of mass, and height of all points."""
+        """Return the section by the points on the ground alone, and all points: width from the centre of mass, and
+        height.
+        """
         azimuth = float(scalar("azimuth", direction("azimuth", azimuth)))
         points = np.stack([self._widths(azimuth), self.vertices[:, 2]], axis=1)
         if plane == "projection":
@@ -194,7 +200,7 @@ class Rock(NamedTuple):
         return section_of_slab(Slab.cut(points, self._widths(azimuth + np.pi / 2), self.faces), self.tolerance)
 
     def _between(self, azimuth: float) -> Section:
-        """The section by the points on the ground alone."""
+        """Return the section by the points on the ground alone."""
         towards = _towards(azimuth)
         places = (self.base[:, :2] - self.centre[:2]) @ towards
         right, left = (np.array([places[k], self.base[k, 2]]) for k in (places.argmax(), places.argmin()))
@@ -205,7 +211,7 @@ class Rock(NamedTuple):
 
 
 def section_of(mesh: Any, azimuth: ArrayLike, base: str, plane: str, unit: str, tolerance: ArrayLike | None) -> Section:
-    """The section of a rock or a mesh; it warns of a base that rolls."""
+    """Return the section of a rock or a mesh, and warn of a base that rolls."""
     rock = mesh if isinstance(mesh, Rock) else Rock.from_mesh(mesh, unit=unit, tolerance=tolerance)
     found = rock.section(azimuth, base, plane)
     if any(found.rolls):

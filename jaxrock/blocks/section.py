@@ -13,7 +13,7 @@ class Section(NamedTuple):
 
     - `right`, `left`: (2,) width and height of the points about which it rocks; `centre`: (2,).
     - `gyration_radius`: sqrt(I/m) about the horizontal axis through the centre of mass.
-    - `rolls`: (2,) whether the base is so round that, on that side, the rock rolls on before it is in balance.
+    - `rolls`: (2,) whether the base is so round on a side that the rock rolls on before it is in balance.
     """
 
     right: Float[np.ndarray, "2"]
@@ -30,7 +30,9 @@ class Section(NamedTuple):
 
 
 def section_of_slab(slab: Slab, tolerance: float) -> tuple[Section, Float[np.ndarray, "n 2"]]:
-    """A slab on the ground within a tolerance of its lowest point, and the points of its outline."""
+    """Return the section of a slab that stands on its points within a tolerance of the lowest, and its outline's
+    points.
+    """
     points = slab.points - [slab.centre[0], 0.0]
     ground = points[points[:, 1] <= points[:, 1].min() + tolerance]
     right, left = ground[ground[:, 0].argmax()], ground[ground[:, 0].argmin()]

@@ -1,4 +1,4 @@
-"""A slab of even thickness: what a vertical plane cuts out of a closed surface. Known numbers only, in NumPy."""
+"""A slab of even thickness, cut out of a closed surface by a vertical plane. Known numbers only, in NumPy."""
 
 from typing import NamedTuple
 
@@ -7,7 +7,7 @@ from jaxtyping import Float, Int
 
 
 class Slab(NamedTuple):
-    """What a plane cuts out of a body; lengths in m.
+    """The cut of a plane through a body; lengths in m.
 
     - `points`: (n, 2) of its outline, in no order; `area` [m^2]; `centre`: (2,) of the area.
     - `gyration_radius`: sqrt(I/m) about the axis through its centre, across.
@@ -29,17 +29,17 @@ class Slab(NamedTuple):
 
         **Arguments:**
 
-        - `points`: vertices in coordinates of the plane; `distance`: by how much they are beyond it.
+        - `points`: vertices in coordinates of the plane; `distance`: their distances beyond it.
         - `faces`: triangles by the numbers of their vertices, all turned outward.
 
         **Returns:** a `Slab`; of several parts, or with holes, where the surface is so. A vertex on the plane counts as
-        beyond it, so the outline is closed whatever lies on it.
+        beyond it, so the outline is closed in every case.
 
-        **Raises:** ValueError where the plane cuts nothing out.
+        **Raises:** ValueError where the plane misses the surface.
         """
         beyond = distance >= 0
         ends = []
-        for leaving in (True, False):  # in every face that is cut one edge leaves the far side, and one enters it
+        for leaving in (True, False):  # in every cut face, one edge leaves the far side and one enters it
             first, second = (np.concatenate([faces[:, (k + turn) % 3] for k in range(3)]) for turn in (0, 1))
             crosses = (beyond[first] == leaving) & (beyond[second] != leaving)
             face = np.tile(np.arange(len(faces)), 3)[crosses]
@@ -50,7 +50,7 @@ class Slab(NamedTuple):
 
     @classmethod
     def _around(cls, start: Float[np.ndarray, "k 2"], end: Float[np.ndarray, "k 2"]) -> "Slab":
-        """Within a closed line of pieces: by Green's theorem, sums over the triangles from one point to each."""
+        """Integrate within a closed line by Green's theorem: sums over the triangles from one point to each segment."""
         if not len(start):
             raise ValueError("The plane must cut the surface, but passes it by.")
         middle = start.mean(axis=0)

@@ -1,4 +1,4 @@
-"""Solutions that need no integration. They import no engine, so they can judge them."""
+"""Solutions in closed form. They import no engine, so they can serve as independent checks of the engines."""
 
 from jaxrock._surface import shown as _shown
 from jaxrock.closed_form import (

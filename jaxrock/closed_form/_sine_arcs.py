@@ -1,9 +1,9 @@
 """The linear block under one cycle of a sine, arc by arc: each arc in closed form, each impact a root in a bracket.
 
-On one side the opening y (rotation over alpha, positive) obeys y'' = y - 1 - s a sin(angle). Where the right-hand
-side without y has one sign, y has at most two zeros, because the operator y'' - y is disconjugate: none inside a
-restoring stretch that starts and ends above ground, and at most one dip, found at the zero of the velocity, in a
-stretch that drives the block outward. So no impact is missed, whatever its size.
+On one side the opening y (rotation over alpha, positive) obeys y'' = y - 1 - s a sin(angle). Where the right-hand side
+without y has one sign, y has at most two zeros, because the operator y'' - y is disconjugate. So there is none inside a
+restoring stretch that starts and ends above ground. In a stretch that drives the block outward there is at most one
+dip, found at the zero of the velocity. So no impact is missed, however small.
 """
 
 import equinox as eqx
@@ -22,7 +22,7 @@ _MOST_PIECES = 4096
 
 
 class Lane(eqx.Module):
-    """Where the block is; speeds are outward and per p t."""
+    """State of the block; speeds are outward and per p t."""
 
     angle: Real  # of the sine
     side: Real  # of the rotation
@@ -33,7 +33,7 @@ class Lane(eqx.Module):
 
 
 def arc(time: Real, lane: Lane, intensity: Real, ratio: Real) -> tuple[Real, Real]:
-    """Opening and speed a time after `lane`; D&D 3.4 with the cancellations written out."""
+    """Return opening and speed at a time after `lane`; D&D 3.4, written so that nothing cancels."""
     push = lane.side * intensity / (1 + ratio**2)
     sine, cosine = push * jnp.sin(lane.angle), push * jnp.cos(lane.angle)
     phase = ratio * time
@@ -47,20 +47,20 @@ def arc(time: Real, lane: Lane, intensity: Real, ratio: Real) -> tuple[Real, Rea
 
 
 def start(intensity: Real) -> Lane:
-    """Uplift: the sine is first at the threshold."""
+    """Return the state at uplift, where the sine first reaches the threshold."""
     zero = jnp.zeros_like(intensity)
     count = jnp.zeros(intensity.shape, jnp.int32)
     return Lane(uplift_phase(intensity), zero - 1, zero, zero, count, zero > 0)
 
 
 def uplift_phase(intensity: Real) -> Real:
-    """psi; D&D 3.3."""
+    """Return psi, the phase of the sine at uplift; D&D 3.3."""
     return jnp.arctan2(1.0, jnp.sqrt((intensity - 1) * (intensity + 1)))
 
 
 @elementwise(refilled=True)  # some blocks take thousands of arcs, most only a few
 def follow(intensity: Given, ratio: Given, restitution: Given) -> Lane:
-    """The state at the end of the pulse; not `done` where the impacts were too many to follow."""
+    """Return the state at the end of the pulse; not `done` where the impacts exceed the limit."""
 
     def going(carry):
         count, lane = carry
@@ -74,13 +74,13 @@ def follow(intensity: Given, ratio: Given, restitution: Given) -> Lane:
 
 
 def _next(lane: Lane, intensity: Real, ratio: Real, restitution: Real) -> Lane:
-    """To the next impact, or to the next change of sign of the driving; where the block rests, to the next uplift."""
+    """Advance to the next impact or change of sign of the driving; a block at rest goes to its next uplift."""
     new, hit = piece(lane, intensity, ratio, restitution)
     return _rested(new, hit, intensity, ratio, restitution, uplift_phase(intensity))
 
 
 def piece(lane: Lane, intensity: Real, ratio: Real, restitution: Real) -> tuple[Lane, Bool[Array, "..."]]:
-    """To the next impact, or to the next change of sign of the driving; and whether it is an impact."""
+    """Advance to the next impact or change of sign of the driving; return the state, and whether it is an impact."""
     psi = uplift_phase(intensity)
     on, off = (jnp.where(lane.side < 0, angle, jnp.pi + angle) for angle in (psi, jnp.pi - psi))
     end = 2 * jnp.pi + 0 * psi
@@ -89,7 +89,7 @@ def piece(lane: Lane, intensity: Real, ratio: Real, restitution: Real) -> tuple[
     span = (edge - lane.angle) / ratio
     opening, speed = arc(span, lane, intensity, ratio)
 
-    # A dip of a driven block: its speed is zero at the lowest point.
+    # The lowest point of a dip of a driven block: there its speed is zero.
     dips = driven & (lane.speed < 0) & (speed > 0)
     lowest = jax.lax.cond(
         jnp.any(dips),
@@ -100,7 +100,7 @@ def piece(lane: Lane, intensity: Real, ratio: Real, restitution: Real) -> tuple[
     down = arc(lowest, lane, intensity, ratio)[0] <= 0
     hit = down & jnp.where(driven, lane.speed < 0, True)
 
-    # From an impact on, opening over time has no zero at the start.
+    # After an impact, opening over time has no zero at the start.
     grounded = lane.opening == 0
 
     def height(time):
@@ -129,9 +129,9 @@ def piece(lane: Lane, intensity: Real, ratio: Real, restitution: Real) -> tuple[
 
 
 def _rested(lane: Lane, hit, intensity: Real, ratio: Real, restitution: Real, psi: Real) -> Lane:
-    """Put a block that has come to rest, or will before the ground can help, to where it uplifts next."""
+    """Advance a block to its next uplift, if it is at rest or will be before the ground can drive it."""
     sine = intensity * jnp.sin(lane.angle)
-    # Between the two driving stretches, at least this restoring; hops end after 2 speed/(restoring (1 - e)).
+    # Lower bound of the restoring between the two driving stretches; hops end after 2 speed/(restoring (1 - e)).
     first = lane.angle < jnp.pi
     until = jnp.where(first, 2 * jnp.pi - lane.angle, (lane.angle + jnp.pi + psi) / 2)
     restoring = 1 - intensity * jnp.abs(jnp.sin(jnp.where(first, lane.angle, until)))
@@ -154,7 +154,10 @@ def _rested(lane: Lane, hit, intensity: Real, ratio: Real, restitution: Real, ps
 
 
 def growth(lane: Lane, restitution: float) -> np.ndarray:
-    """Positive where the block overturns after the pulse: at once, or after one more impact; -1 if not followed."""
+    """Return a number that is positive where the block overturns after the pulse, at once or after one more impact.
+
+    It is -1 where the block was not followed to the end.
+    """
     directly = lane.opening + lane.speed - 1
     arrival = np.sqrt(np.maximum(lane.speed**2 + lane.opening * (2 - lane.opening), 0.0))
     return np.where(lane.done, np.maximum(directly, restitution * arrival - 1), -1.0)

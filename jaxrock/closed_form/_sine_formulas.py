@@ -1,4 +1,5 @@
-"""The formulas of D&D (see `sine_pulse`) for arrays of one shape, as they are shared; nothing is checked here.
+"""The formulas of D&D (see `sine_pulse`) for arrays of one shape, shared by the public functions; nothing is checked
+here.
 
 `a` is the intensity, `w` the frequency ratio, `e` the restitution.
 """
@@ -20,34 +21,34 @@ def _above_one(name, value):
     return checked(name, value, "be greater than 1 (the block uplifts)", lambda x: (x > 1) & (x < np.inf))
 
 
-# Of the public functions: arguments are checked by these names, and broadcast.
+# Decorator of the public functions: it checks arguments by these names, and broadcasts them.
 elementwise_in_sine = elementwise(intensity=_above_one, frequency_ratio=positive, restitution=share, time=finite)
 
 
 def end_of_pulse(a: Array, w: Array) -> Array:
-    """p T_ex: when the pulse ends."""
+    """Return p T_ex, the time from uplift to the end of the pulse."""
     return (2 * jnp.pi - arcs.uplift_phase(a)) / w
 
 
 def series_constants(a: Array, w: Array) -> tuple[Array, ...]:
-    """A0*, B0*, C0*, omega, p T_ex; D&D 3.9."""
+    """Return A0*, B0*, C0*, omega, p T_ex; D&D 3.9."""
     slope = jnp.sqrt((a - 1) * (a + 1))
     return w * (w + slope) / (w**2 + 1), w * (w - slope) / (w**2 + 1), 2 * a / (w**2 + 1), w, end_of_pulse(a, w)
 
 
 def free_coordinates(A0, B0, C0, w, end) -> tuple[Array, Array]:
-    """1 - |rotation| +- velocity at the end of the pulse: the factors of D0*, each with its exponential."""
+    """Return 1 - |rotation| +- velocity at the end of the pulse: the factors of D0*, each with its exponential."""
     return A0 * jnp.exp(-end) - w * C0 / 2, B0 * jnp.exp(end) + w * C0 / 2
 
 
 def coordinate_product(a: Array, w: Array) -> Array:
-    """D0*; D&D 3.9, first line."""
+    """Return D0*; D&D 3.9, first line."""
     decaying, growing = free_coordinates(*series_constants(a, w))
     return decaying * growing
 
 
 def no_impact(w: Array) -> Array:
-    """The intensity from which on a block overturns without impact; D&D 3.10."""
+    """Return the least intensity that overturns a block without impact; D&D 3.10."""
 
     def excess(slope, w):
         a = jnp.sqrt(1 + slope**2)
@@ -60,7 +61,7 @@ def no_impact(w: Array) -> Array:
 
 
 def impact_at_end(w: Array) -> Array:
-    """The intensity at which the first impact comes just as the pulse ends; D&D 3.31."""
+    """Return the intensity at which the first impact comes just as the pulse ends; D&D 3.31."""
 
     def excess(logarithm, w):
         missing = jnp.exp(logarithm)
@@ -68,25 +69,25 @@ def impact_at_end(w: Array) -> Array:
         side = 1 + w**2 + jnp.sqrt(1 + (2 + slope**2) * w**2)
         return logarithm + (2 * jnp.pi - jnp.arctan2(1.0, slope)) / w - jnp.log(side / w)
 
-    # The slope is near omega where omega is small: what is missing is found by its logarithm.
+    # For small omega the slope is near omega: the logarithm of their difference is the unknown.
     lowest = jnp.log((1 + w**2) / w) - 2 * jnp.pi / w - 1
     missing = jnp.exp(bracketed_root(excess, lowest, jnp.log(w), w))
     return jnp.sqrt(1 + (w - missing) ** 2)
 
 
 def first_excursion(time: Array, a: Array, w: Array) -> tuple[Array, Array]:
-    """Opening and speed of the first excursion; D&D 3.4."""
+    """Return opening and speed of the first excursion; D&D 3.4."""
     return arcs.arc(time, arcs.start(a), a, w)
 
 
 def impact_during_pulse(a: Array, w: Array) -> Array:
-    """First root of D&D 3.21: the block can only fall after the driving stretch, and then falls once."""
+    """Return the first root of D&D 3.21: the block can fall only after the driving stretch, and then falls once."""
     lower = (jnp.pi - 2 * arcs.uplift_phase(a)) / w
     return bracketed_root(lambda t, a, w: first_excursion(t, a, w)[0], lower, end_of_pulse(a, w), a, w)
 
 
 def first_impact(a: Array, w: Array) -> Array:
-    """When the first excursion ends; inf where it does not."""
+    """Return the time at which the first excursion ends; inf where it does not."""
     limit, lost = impact_at_end(w), no_impact(w)
     middle = (limit + lost) / 2
     after = jnp.where((a > limit) & (a < lost), a, middle)
@@ -98,17 +99,17 @@ def first_impact(a: Array, w: Array) -> Array:
 
 
 def impact_speed(time: Array, a: Array, w: Array) -> Array:
-    """Velocity over p alpha with which the first excursion ends at its `first_impact`; D&D 3.22, 3.15."""
+    """Return the speed over p alpha with which the first excursion ends at its `first_impact`; D&D 3.22, 3.15."""
     late = time > end_of_pulse(a, w)
     lost = jnp.where(late, 1 - coordinate_product(a, w), 1.0)
     return jnp.where(late, jnp.sqrt(lost), -first_excursion(time, a, w)[1])
 
 
 def growth_after_impact(a: Array, w: Array, e: Array, time: Array, jump: bool = False) -> Array:
-    """Left minus right side of D&D 3.20, over 2 e^(p T_ex - time): positive where one impact overturns."""
+    """Return left minus right side of D&D 3.20, over 2 e^(p T_ex - time): positive where one impact overturns."""
     A0, B0, C0, _, end = series_constants(a, w)
     angle = w * time + arcs.uplift_phase(a)
-    if jump:  # 3.22 as it stands: an approximate time is not a zero of the rotation
+    if jump:  # 3.22 as printed: an approximate time is not a zero of the rotation
         twice_speed = B0 * jnp.exp(time) - A0 * jnp.exp(-time) + C0 * w * jnp.cos(angle)
     else:
         twice_speed = -2 * first_excursion(time, a, w)[1]
@@ -117,7 +118,7 @@ def growth_after_impact(a: Array, w: Array, e: Array, time: Array, jump: bool = 
 
 
 def approximate_impact(a: Array, w: Array) -> Array:
-    """D&D 3.29, with kappa and lambda of 3.26."""
+    """Return the approximate time of impact, D&D 3.29, with kappa and lambda of 3.26; NaN where it is not real."""
     A0, B0, C0, _, _ = series_constants(a, w)
     angle = w + arcs.uplift_phase(a)
     sine, cosine = jnp.sin(angle), jnp.cos(angle)

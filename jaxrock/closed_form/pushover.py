@@ -1,6 +1,6 @@
-"""What holds a rigid block without any motion: force, energy, and the blow and the free swing that they allow.
+"""Static resistance of a rigid block: force, energy, and the initial velocity and free rocking that follow from them.
 
-And what holds the column on a spring that stands for it, and what overturns that.
+Also the static resistance of the spring models that replace the block, and their overturning moment.
 """
 
 from typing import Any
@@ -83,8 +83,8 @@ def spring_force(rotation: Real, alpha: Real, kind: str = "SM1", law: str = "lin
     **Arguments:**
 
     - `rotation`: [rad], in [0, pi/2). `alpha`: slenderness angle [rad], in (0, pi/2).
-    - `kind`, `law`: as in `jaxrock.Spring`. The mass of "SM2" is at the pivot: there it is the moment over the weight
-      and the arm R cos(alpha) cos(rotation) of the others.
+    - `kind`, `law`: as in `jaxrock.Spring`. The mass of "SM2" is at the pivot: its value is the moment over the weight
+      and over the arm R cos(alpha) cos(rotation) of the others.
 
     **Returns:** the force; tan(alpha) at rotation 0 in all of them, as `force`.
 
@@ -128,7 +128,7 @@ def energy(rotation: Real, alpha: Real) -> Result:
     **Source:** Housner (1963); Dimitrakopoulos & DeJong (2012), equation 4.12 corrected:
     cos(alpha - rotation) - cos(alpha).
     """
-    # The difference as a product: small rotations of slender blocks do not cancel.
+    # A product in place of the difference: small rotations of slender blocks do not cancel.
     return 2 * jnp.sin(rotation / 2) * jnp.sin(alpha - rotation / 2)
 
 
@@ -167,7 +167,7 @@ def amplitude_after(impacts: Real, amplitude: Real, restitution: Real) -> Result
 
     **Source:** Housner (1963), equation 10: each impact multiplies the energy by restitution^2.
     """
-    kept = jnp.where(impacts == 0, 1.0, restitution)  # a power of zero to zero has no slope
+    kept = jnp.where(impacts == 0, 1.0, restitution)  # 0^0 would have no derivative
     part: Any = kept ** (2 * impacts)  # of the energy
-    missing = (1 - part) + part * (1 - amplitude) ** 2  # for balance; one less what is left would cancel near it
+    missing = (1 - part) + part * (1 - amplitude) ** 2  # energy to balance, without cancellation
     return part * amplitude * (2 - amplitude) / (1 + jnp.sqrt(missing))

@@ -13,7 +13,7 @@ def __dir__() -> list[str]:
     return __all__
 
 
-_inertia = Range("be finite, and at least 1", 1.0, jnp.inf, lambda x: (x >= 1) & (x < jnp.inf))  # 1: all in one point
+_inertia = Range("be finite, and at least 1", 1.0, jnp.inf, lambda x: (x >= 1) & (x < jnp.inf))  # 1: a point
 
 
 @elementwise(alpha=acute, inertia=_inertia)

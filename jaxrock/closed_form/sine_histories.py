@@ -7,7 +7,7 @@ from jaxtyping import Array
 from jaxrock.closed_form import _sine_arcs as arcs, _sine_formulas as formulas
 from jaxrock.closed_form._sine_formulas import Real, Result, elementwise_in_sine
 
-_PIECES = 3  # after an impact during the pulse: until the second driving stretch, in it, and after it
+_PIECES = 3  # after an impact during the pulse: before, within and after the second driving stretch
 
 
 def rotation(time: Real, intensity: Real, frequency_ratio: Real, restitution: Real) -> Result:
@@ -20,7 +20,7 @@ def rotation(time: Real, intensity: Real, frequency_ratio: Real, restitution: Re
     - `frequency_ratio`: omega_g/p, positive.
     - `restitution`: of the first impact, in [0, 1].
 
-    **Returns:** theta/alpha, negative up to the first impact; not a number after the second: ask an engine.
+    **Returns:** theta/alpha, negative up to the first impact; NaN after the second, where an engine is needed.
 
     **Raises:** ValueError for arguments outside their ranges.
 
@@ -39,7 +39,7 @@ def velocity(time: Real, intensity: Real, frequency_ratio: Real, restitution: Re
 
 @elementwise_in_sine
 def impact_velocity(intensity: Real, frequency_ratio: Real) -> Result:
-    """Angular velocity over p alpha just before the first impact; not a number where the block overturns before.
+    """Angular velocity over p alpha just before the first impact; NaN where the block overturns before.
 
     **Arguments:** as in `rotation`.
 
@@ -53,11 +53,11 @@ def impact_velocity(intensity: Real, frequency_ratio: Real) -> Result:
 
 @elementwise_in_sine
 def _history(time: Real, intensity: Real, frequency_ratio: Real, restitution: Real) -> tuple[Result, Result]:
-    """Rotation and velocity, in one program."""
+    """Return rotation and velocity, computed together."""
     a, w, e = intensity, frequency_ratio, restitution
     end, impact = formulas.end_of_pulse(a, w), formulas.first_impact(a, w)
     hits = jnp.isfinite(impact)
-    # At an impact, too, the slope by time is that before it: of a tie `jnp.clip` would take half.
+    # At an impact, too, the time derivative is that before it; `jnp.clip` would halve it at a tie.
     before = jnp.where(time > 0, jnp.where(time <= impact, time, impact), 0.0)
     first = _flight(before, end, arcs.start(a), a, w)
     impact = jnp.where(hits, impact, end)
@@ -74,7 +74,7 @@ def _history(time: Real, intensity: Real, frequency_ratio: Real, restitution: Re
 
 
 def _flight(since: Array, left: Array, lane: arcs.Lane, a: Array, w: Array) -> tuple[Array, Array]:
-    """Opening and speed at a time since `lane`, of which the pulse lasts the first part: D&D 3.4, then 3.5."""
+    """Return opening and speed at a time since `lane`: D&D 3.4 for the `left` part of the pulse, then 3.5."""
     lasts = since <= left
     opening, speed = arcs.arc(jnp.where(lasts, since, left), lane, a, w)
     free = jnp.where(lasts, 0.0, since - left)
@@ -83,7 +83,7 @@ def _flight(since: Array, left: Array, lane: arcs.Lane, a: Array, w: Array) -> t
 
 
 def _return(lane: arcs.Lane, left: Array, a: Array, w: Array, e: Array) -> Array:
-    """How long after `lane` the block is back on the ground; inf where it overturns."""
+    """Return the time from `lane` to the block's return to the ground; inf where it overturns."""
 
     def further(_, carry):
         lane, hit = carry

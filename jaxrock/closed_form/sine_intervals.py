@@ -1,4 +1,4 @@
-"""Every interval of intensity that overturns a block under one cycle of a sine; terms as in `sine_pulse`."""
+"""All intervals of intensity that overturn a block under one cycle of a sine; terms as in `sine_pulse`."""
 
 from typing import Annotated, Any
 
@@ -15,15 +15,16 @@ from jaxrock.closed_form.sine_limits import after_pulse_limits, impact_time_limi
 
 _above_one = Range("be above 1, and at most 1e6", 1.0, np.inf, lambda x: (x > 1) & (x <= 1e6))
 _ratio = Range("be positive, from 1e-3 to 1e3", 0.0, np.inf, lambda x: (x >= 1e-3) & (x <= 1e3))
-_MOST_DROP = 8  # impacts lost from one sample to the next, where turns are sought one by one
+_MOST_DROP = 8  # largest drop of impacts between samples for which each change is searched separately
 
 
 class OverturningIntervals(eqx.Module):
     """The intensities that overturn a block, from the lowest: everything between `lower` and `upper`.
 
     - `impacts`: before overturning, in the middle of the interval.
-    Without loss (restitution 1) the safe gap below the last interval closes, and it touches the one before.
     - `searched_from`: below this intensity nothing was searched.
+
+    Without loss (restitution 1) the safe gap below the last interval closes, and it touches the one before.
     """
 
     __repr__ = described
@@ -42,19 +43,19 @@ def overturning_intervals(
     searched_from: Annotated[float, known(_above_one)] = 1.0001,
     points: Annotated[int, at_least(2, 10**7)] = 4096,
 ) -> OverturningIntervals:
-    """Every interval of intensity that overturns a block, the islands with 3, 5, 7... impacts included.
+    """Find every interval of intensity that overturns a block, the islands with 3, 5, 7... impacts included.
 
     **Arguments:**
 
     - `frequency_ratio`: omega_g/p, positive. `restitution`: in [0, 1].
     - `searched_from`: lowest intensity searched, above 1.
-    - `points`: samples of the search below `impact_time_limit`. Narrower islands and gaps are found where the number
-      of impacts changes with them, as it did wherever this was checked.
+    - `points`: samples of the search below `impact_time_limit`. Islands and gaps between samples are found where the
+      number of impacts changes with them, as it did in all cases checked.
 
     **Returns:** `OverturningIntervals`; the ends are roots to rounding.
 
-    **Source:** D&D 3.10, 3.18, 3.20 and, for more impacts, the same condition after each arc in closed form; what
-    the paper calls complete covers frequency ratios above 1.05 only.
+    **Source:** D&D 3.10, 3.18 and 3.20. For more impacts, the same condition after each arc in closed form. The set
+    that the paper calls complete covers frequency ratios above 1.05 only.
     """
     ratio = frequency_ratio
     limit, last = float(impact_time_limit(ratio)), float(no_impact_limit(ratio))
@@ -65,7 +66,7 @@ def overturning_intervals(
     elif np.isfinite(stops):
         lower.append(begins)
         upper.append(stops)
-    # What lies above the limit was not sampled, and may lie below where the search begins.
+    # Ends above the limit are exact roots, which may lie below the start of the search.
     lower, upper = np.maximum([*lower, last], searched_from), np.array([*upper, np.inf])
     lower, upper = lower[lower < upper], upper[lower < upper]
     impacts = _at(np.minimum((lower[:-1] + upper[:-1]) / 2, np.nextafter(last, 0)), ratio, restitution)[1]
@@ -73,10 +74,10 @@ def overturning_intervals(
 
 
 def _sampled(searched_from: float, limit: float, ratio: float, restitution: float, points: int) -> tuple[list, list]:
-    """Lower and upper ends of the intervals below a limit; the last one goes on above it where its upper end lacks."""
+    """Return the ends of the intervals below a limit; the last one continues above it where it has no upper end."""
     samples = np.linspace(searched_from, max(limit * (1 - 1e-13), searched_from), points)
     values, impacts = _at(samples, ratio, restitution)
-    # Where the number of impacts changes there is an island or a gap, however narrow; else it is near an extreme.
+    # A change in the number of impacts marks an island or a gap, however narrow; others lie near a local extreme.
     turns = _impact_turns(samples, impacts, ratio, restitution)
     step = (limit - searched_from) / points * np.linspace(-1, 1, 129)
     more = [turns, _inside(turns, samples[1] - samples[0]), (samples[_near_zero(values), None] + step).ravel()]
@@ -98,7 +99,7 @@ def _sampled(searched_from: float, limit: float, ratio: float, restitution: floa
 
 
 def _impact_turns(samples: np.ndarray, impacts: np.ndarray, ratio, restitution) -> np.ndarray:
-    """Both sides of the intensities at which the number of impacts falls, each to rounding."""
+    """Return both sides of the intensities at which the number of impacts falls, each to rounding."""
     drop = impacts[:-1] - impacts[1:]
     pairs = np.flatnonzero((drop > 0) & (drop <= _MOST_DROP))
     levels = [(i, level) for i in pairs for level in range(impacts[i + 1], impacts[i])]
@@ -113,7 +114,7 @@ def _impact_turns(samples: np.ndarray, impacts: np.ndarray, ratio, restitution) 
 
 
 def _at(points: np.ndarray, ratio: float, restitution: float) -> tuple[np.ndarray, np.ndarray]:
-    """`growth` at the end of the pulse, and the impacts before overturning, at points of any shape."""
+    """Return `growth` at the end of the pulse, and the impacts before overturning, at points of any shape."""
     if not points.size:
         return np.zeros(points.shape), np.zeros(points.shape, int)
     end: Any = jax.tree.map(np.asarray, arcs.follow(points.ravel(), ratio, restitution))
@@ -122,7 +123,7 @@ def _at(points: np.ndarray, ratio: float, restitution: float) -> tuple[np.ndarra
 
 
 def _narrowed(below, above, like_below, levels: int) -> tuple[np.ndarray, np.ndarray]:
-    """Brackets of a change, each cut into 4 at every level."""
+    """Narrow the brackets of a change, each cut into 4 at every level."""
     rows = np.arange(below.size)
     for _ in range(levels):
         grid = below[:, None] + (above - below)[:, None] * np.linspace(0, 1, 5)
@@ -132,14 +133,14 @@ def _narrowed(below, above, like_below, levels: int) -> tuple[np.ndarray, np.nda
 
 
 def _inside(turns: np.ndarray, widest: float) -> np.ndarray:
-    """Samples between neighbouring turns that lie within one step of the search."""
+    """Return samples between neighbouring turns that lie within one step of the search."""
     gaps = np.diff(turns)
     narrow = gaps < widest
     return (turns[:-1, None] + gaps[:, None] * np.linspace(0, 1, 33)[1:-1])[narrow].ravel()
 
 
 def _near_zero(values: np.ndarray) -> np.ndarray:
-    """Samples that are local extremes towards zero."""
+    """Return the indices of samples that are local extremes towards zero."""
     size, sign = np.abs(values), np.sign(values)
     lowest = (size[1:-1] <= size[:-2]) & (size[1:-1] <= size[2:]) & (size[1:-1] < 0.3)
     return 1 + np.flatnonzero(lowest & (sign[1:-1] == sign[:-2]) & (sign[1:-1] == sign[2:]))

@@ -15,7 +15,7 @@ _GRID = 256  # samples that may bracket a root of case 1.1, the topmost first
 
 @elementwise_in_sine
 def no_impact_limit(frequency_ratio: Real) -> Result:
-    """The intensity from which on a block overturns without impact (case 2), whatever its restitution.
+    """Least intensity that overturns a block without impact (case 2), at any restitution.
 
     **Source:** D&D 3.10.
     """
@@ -24,7 +24,7 @@ def no_impact_limit(frequency_ratio: Real) -> Result:
 
 @elementwise_in_sine
 def impact_time_limit(frequency_ratio: Real) -> Result:
-    """The intensity at which the first impact comes just as the pulse ends; above it, later.
+    """Intensity at which the first impact comes just as the pulse ends; above it, the impact comes later.
 
     **Source:** D&D 3.31.
     """
@@ -33,9 +33,9 @@ def impact_time_limit(frequency_ratio: Real) -> Result:
 
 @elementwise_in_sine
 def after_pulse_limits(frequency_ratio: Real, restitution: Real) -> tuple[Result, Result]:
-    """The two intensities between which a block overturns after one impact that comes after the pulse (case 1.2).
+    """Both ends of the intensities at which a block overturns after one impact that comes after the pulse (case 1.2).
 
-    **Returns:** (lower, upper); lower is `impact_time_limit` where the interval goes on below it; both inf where
+    **Returns:** (lower, upper); lower is `impact_time_limit` where the interval continues below it; both inf where
     there is no such interval.
 
     **Source:** D&D 3.18, searched only where it holds: between 3.31 and 3.10.
@@ -64,7 +64,7 @@ def after_pulse_limits(frequency_ratio: Real, restitution: Real) -> tuple[Result
 
 @elementwise_in_sine
 def during_pulse_limit(frequency_ratio: Real, restitution: Real) -> Result:
-    """The intensity from which on, up to `impact_time_limit`, one impact during the pulse overturns a block (case 1.1).
+    """Least intensity from which, up to `impact_time_limit`, one impact during the pulse overturns a block (case 1.1).
 
     **Returns:** the intensity; inf where there is no such interval.
 
@@ -96,7 +96,7 @@ def approximate_during_pulse_limit(frequency_ratio: Real, restitution: Real) -> 
 
 
 def _topmost_root(excess: Callable, last: Array, w: Array, e: Array) -> Array:
-    """The highest intensity up to `last` at which `excess` turns positive; inf if there is none."""
+    """Return the highest intensity up to `last` at which `excess` turns positive; inf if there is none."""
     last, *still = jax.lax.stop_gradient((last, w, e))
 
     def sample(number):

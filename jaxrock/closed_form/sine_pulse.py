@@ -62,7 +62,7 @@ class Constants(eqx.Module):
 
 @elementwise_in_sine
 def constants(intensity: Real, frequency_ratio: Real) -> Constants:
-    """What all formulas of the sine pulse are made of.
+    """Constants in the formulas of the sine pulse.
 
     **Arguments:**
 
@@ -82,7 +82,7 @@ def constants(intensity: Real, frequency_ratio: Real) -> Constants:
 
 @elementwise_in_sine
 def impact_time(intensity: Real, frequency_ratio: Real) -> Result:
-    """When the block first falls back to the ground, p t from uplift; inf where it overturns before.
+    """Time at which the block first falls back to the ground, p t from uplift; inf where it overturns before.
 
     **Source:** D&D 3.21 (while the pulse lasts), 3.13 (after it).
     """
@@ -91,7 +91,7 @@ def impact_time(intensity: Real, frequency_ratio: Real) -> Result:
 
 @elementwise_in_sine
 def approximate_impact_time(intensity: Real, frequency_ratio: Real) -> Result:
-    """D&D's approximation of `impact_time` while the pulse lasts; not a number where the formula is not real.
+    """D&D's approximation of `impact_time` while the pulse lasts; NaN where the formula is not real.
 
     **Source:** D&D 3.29.
     """
@@ -100,11 +100,11 @@ def approximate_impact_time(intensity: Real, frequency_ratio: Real) -> Result:
 
 @elementwise_in_sine
 def peak_after_pulse(intensity: Real, frequency_ratio: Real, restitution: Real) -> Result:
-    """The largest rotation over alpha after the first impact, where that comes after the pulse.
+    """Largest rotation over alpha after the first impact, where that comes after the pulse.
 
-    Exact between `impact_time_limit` and `no_impact_limit`. Below, where the impact comes while the pulse lasts, it is
-    what the formula gives (D&D draw it dashed), and says nothing of the block, not that it overturns either. The first
-    excursion, before the impact, may be larger: see `first_peak`.
+    Exact between `impact_time_limit` and `no_impact_limit`. Below, the impact comes while the pulse lasts: the value is
+    that of the formula (D&D draw it dashed), and predicts neither the peak nor overturning. The first excursion, before
+    the impact, may be larger: see `first_peak`.
 
     **Returns:** inf where that impact overturns, and where the block overturns without one.
 
@@ -127,14 +127,16 @@ def restitution_scale_law(intensity: Real, frequency_ratio: Real, restitution: R
 
 
 def _energy_after_impact(a: Array, w: Array, e: Array) -> Array:
-    """Energy after a first impact that comes after the pulse, over that of balance: restitution^2 (1 - D0*); inf where
-    no impact comes, which D0* does not tell."""
+    """Return the energy after a first impact after the pulse, over that of balance: restitution^2 (1 - D0*).
+
+    It is inf where no impact comes, which D0* does not show.
+    """
     return jnp.where(a < formulas.no_impact(w), e**2 * (1 - formulas.coordinate_product(a, w)), jnp.inf)
 
 
 @elementwise_in_sine
 def first_peak(intensity: Real, frequency_ratio: Real) -> Result:
-    """The largest rotation over alpha before the first impact; inf where the block overturns without impact.
+    """Largest rotation over alpha before the first impact; inf where the block overturns without impact.
 
     **Source:** D&D 3.4, 3.5 where the velocity is zero.
     """

@@ -1,9 +1,9 @@
 """The single-lobe pulse in closed form: the linear block under one hump of any shape, from rectangle to spike.
 
-Everything is dimensionless. `uplift_strength` is g alpha/A_g (1/intensity): below 1 the block uplifts.
-`pulse_duration` is p t_d. `shape` runs from -inf (rectangle) through 0 (triangle) to +inf (spike, under which
-nothing moves). Times are in t_d, rotations in alpha, velocities in p alpha. As in the paper, and other than in the
-rest of jaxrock, a positive pulse drives positive rotation. Arguments broadcast; all is smooth in all of them.
+Everything is dimensionless. `uplift_strength` is g alpha/A_g (1/intensity): below 1 the block uplifts. `pulse_duration`
+is p t_d. `shape` runs from -inf (rectangle) through 0 (triangle) to +inf (spike, which moves nothing). Times are in
+t_d, rotations in alpha, velocities in p alpha. As in the paper, and unlike the rest of jaxrock, a positive pulse drives
+positive rotation. Arguments broadcast; all functions are smooth in all of them.
 
 The motion is written with divided differences of the exponential in place of the paper's sums, so that it has no
 singularities at shape 0 and duration 2 |shape|, and nothing cancels.
@@ -34,12 +34,12 @@ def __dir__() -> list[str]:
 Real = Inexact[ArrayLike, "..."]
 Result = Float[Array, "..."]
 
-_MOST_SHAPE = 1e17  # from here on the pulse is its limit to rounding
-_STEEP = 30.0  # from here on exponentials of -shape are added in other places
+_MOST_SHAPE = 1e17  # beyond, the pulse is its limit to rounding
+_STEEP = 30.0  # beyond, exponentials of -shape enter the sums at other places
 
 
 class Region(enum.IntEnum):
-    """What becomes of a block, as in V figures 3.1 to 3.3."""
+    """The outcome of a block, as in V figures 3.1 to 3.3."""
 
     overturns_while_rising = 1  # O1: past alpha before the pulse has its peak
     overturns_while_falling = 2  # O2: past alpha before the pulse ends
@@ -75,7 +75,7 @@ def pulse(time: Real, shape: Real) -> Result:
 
 @_elementwise
 def uplift_time(uplift_strength: Real, shape: Real) -> Result:
-    """When the block uplifts [t_d]; inf where it does not.
+    """Time at which the block uplifts [t_d]; inf where it does not.
 
     **Source:** V 2.4.
     """
@@ -85,7 +85,7 @@ def uplift_time(uplift_strength: Real, shape: Real) -> Result:
 
 @_elementwise
 def safety_wall(pulse_duration: Real, shape: Real) -> Result:
-    """The uplift strength below which a block overturns, whatever its restitution.
+    """Uplift strength below which a block overturns, at any restitution.
 
     **Arguments:**
 
@@ -99,7 +99,7 @@ def safety_wall(pulse_duration: Real, shape: Real) -> Result:
 
 @_elementwise
 def rising_wall(pulse_duration: Real, shape: Real) -> Result:
-    """The uplift strength below which a block is past alpha before the pulse has its peak: between O1 and O2.
+    """Uplift strength below which a block is past alpha before the pulse has its peak: between O1 and O2.
 
     **Source:** V 3.8b, 3.9b, 3.10b.
     """
@@ -110,7 +110,7 @@ def rising_wall(pulse_duration: Real, shape: Real) -> Result:
 
 @_elementwise
 def falling_wall(pulse_duration: Real, shape: Real) -> Result:
-    """The uplift strength below which a block is past alpha before the pulse ends: between O2 and O3.
+    """Uplift strength below which a block is past alpha before the pulse ends: between O2 and O3.
 
     **Source:** V 3.8a (without the term -f^2 that is printed on its right), 3.9a, 3.10a corrected.
     """
@@ -121,7 +121,7 @@ def falling_wall(pulse_duration: Real, shape: Real) -> Result:
 
 @_elementwise
 def peak_border(pulse_duration: Real, shape: Real) -> Result:
-    """The uplift strength with which a block has its largest rotation just as the pulse ends: between S2 and S1.
+    """Uplift strength at which a block has its largest rotation just as the pulse ends: between S2 and S1.
 
     **Source:** V 3.15a at time 1.
     """
@@ -141,8 +141,8 @@ def rotation(time: Real, uplift_strength: Real, pulse_duration: Real, shape: Rea
     - `pulse_duration`: p t_d, positive.
     - `shape`: from -inf to +inf.
 
-    **Returns:** theta/alpha; not a number after the first return, from where it depends on the restitution:
-    ask an engine.
+    **Returns:** theta/alpha; NaN after the first return, from which on it depends on the restitution: an engine is
+    needed there.
 
     **Source:** V 3.2, 3.4, 3.6.
     """
@@ -160,7 +160,7 @@ def velocity(time: Real, uplift_strength: Real, pulse_duration: Real, shape: Rea
 
 @_elementwise
 def peak_time(uplift_strength: Real, pulse_duration: Real, shape: Real) -> Result:
-    """When the rotation is largest [t_d]: inf for a block that overturns, 1/2 (the limit) for one that stays at rest.
+    """Time of the largest rotation [t_d]: inf for a block that overturns, 1/2 (the limit) for one that stays at rest.
 
     **Source:** V 3.15a, 3.15b, 3.16, 3.17a and b corrected.
     """
@@ -169,12 +169,12 @@ def peak_time(uplift_strength: Real, pulse_duration: Real, shape: Real) -> Resul
 
 @_elementwise
 def peak_rotation(uplift_strength: Real, pulse_duration: Real, shape: Real) -> Result:
-    """The largest rotation over alpha, whatever the restitution: inf for a block that overturns.
+    """Largest rotation over alpha, at any restitution: inf for a block that overturns.
 
     **Arguments:** as in `rotation`.
 
-    The first peak is the largest: a pulse of one sign that has passed its peak gives back less at each
-    excursion than the impact before it has taken.
+    The first peak is the largest: a pulse of one sign that has passed its peak gives back less at each excursion than
+    the impact before it has taken.
 
     **Source:** V 3.2 at the time of 3.15; 3.18.
     """
@@ -183,7 +183,7 @@ def peak_rotation(uplift_strength: Real, pulse_duration: Real, shape: Real) -> R
 
 @_elementwise
 def region(uplift_strength: Real, pulse_duration: Real, shape: Real) -> Int[Array, "..."]:
-    """What becomes of the block: one of the numbers in `Region`.
+    """The outcome of the block: one of the numbers in `Region`.
 
     **Source:** V figures 3.1 to 3.3.
     """
@@ -199,7 +199,7 @@ def region(uplift_strength: Real, pulse_duration: Real, shape: Real) -> Int[Arra
 
 @_elementwise
 def critical_duration(uplift_strength: Real, shape: Real) -> Result:
-    """The pulse duration p t_d from which on a block overturns; inf for one that does not uplift.
+    """Least pulse duration p t_d that overturns a block; inf for one that does not uplift.
 
     **Source:** the inverse of V 3.12; -log(1 - strength) for a rectangle.
     """
@@ -218,7 +218,7 @@ def critical_duration(uplift_strength: Real, shape: Real) -> Result:
 
 @_elementwise
 def critical_shape(uplift_strength: Real, pulse_duration: Real) -> Result:
-    """The shape below which a block overturns; -inf where not even a rectangle is enough.
+    """Shape below which a block overturns; -inf where not even a rectangle overturns it.
 
     **Source:** the inverse of V 3.12.
     """
@@ -240,22 +240,22 @@ def _clipped(shape: Array) -> Array:
 
 
 def _parts(value: Array) -> tuple[Array, Array]:
-    """Positive and negative part, with the derivatives of a positive number at 0."""
+    """Return the positive and negative part, with the derivatives of a positive number at 0."""
     return jnp.where(value >= 0, value, 0.0), jnp.where(value < 0, value, 0.0)
 
 
 def _unfolded(position: Array) -> Array:
-    """(-1, 1) to all shapes."""
+    """Map (-1, 1) to all shapes."""
     return 10 * position / ((1 - position) * (1 + position))
 
 
 def _uplift(strength: Array, shape: Array) -> tuple[Array, Array]:
-    """Time of uplift, and what is left of the rising branch then [t_d]; V 2.4."""
+    """Return the time of uplift, and the rest of the rising branch after it [t_d]; V 2.4."""
     strength = jnp.where(strength < 1, strength, 1.0)
     lack = 1 - strength
-    # log(1 + strength (e^shape - 1))/shape, and the same seen from the peak
+    # log(1 + strength (e^shape - 1))/shape, and the same measured from the peak
     low, high = jnp.where(shape >= -_STEEP, shape, -_STEEP), jnp.where(shape <= _STEEP, shape, _STEEP)
-    # Under spikes 1 - y is strength + lack e^-shape, which rounding would make 0.
+    # For spikes 1 - y is strength + lack e^-shape, which would round to 0.
     weak, tiny = (shape > 1) & (strength < 0.5), jnp.finfo(strength.dtype).tiny
     spiked = -jnp.log(jnp.maximum(strength + lack * jnp.exp(-low), tiny)) / jnp.where(weak, shape, 1.0)
     left = lack * growth_ratio(-low) * logarithm_ratio(jnp.where(weak, 0.5, lack * low * growth_ratio(-low)))
@@ -269,18 +269,18 @@ def _uplift(strength: Array, shape: Array) -> tuple[Array, Array]:
 
 
 def _safety_wall(duration: Array, shape: Array) -> Array:
-    """V 3.12. With x = 1/2 - shape/duration it is where twice the uplift time is -log(1 - x M)/(x f)."""
+    """V 3.12. With x = 1/2 - shape/duration, twice the uplift time at the wall is -log(1 - x M)/(x f)."""
     mild = jnp.where(shape <= _STEEP, shape, _STEEP)
     x = 0.5 - mild / duration
     spread = exponential_difference(0.0, mild - duration / 2, -duration) * duration  # M/f
     small = x * duration * spread
     near = spread * logarithm_ratio(jnp.where(small < 0.5, small, 0.0))
-    # 1 - x M is e^-f (1 + f (e^s - 1)/s), s = f/2 + shape: so where it is small
+    # where 1 - x M is small, use its form e^-f (1 + f (e^s - 1)/s), s = f/2 + shape
     up, down = _parts(duration / 2 + mild)
     logarithm = duration - up - jnp.log(jnp.exp(-up) + duration * growth_ratio(down - up))
     twice = jnp.where(small < 0.5, near, logarithm / jnp.where(small < 0.5, 1.0, x * duration))
     wall = twice * growth_ratio(mild * twice) / growth_ratio(mild)
-    # A spike: the same, seen from the peak of the pulse.
+    # A spike: the same, measured from the peak of the pulse.
     steep = jnp.where(shape > _STEEP, shape, _STEEP)
     s, x = steep + duration / 2, steep - duration / 2
     rest = growth_ratio(-s)
@@ -292,10 +292,10 @@ def _safety_wall(duration: Array, shape: Array) -> Array:
 
 
 def _rising(since: Array, strength: Array, duration: Array, shape: Array) -> tuple[Array, Array]:
-    """Rotation and velocity times strength at a time `since` uplift, while the pulse rises; V 3.2, H = 0."""
+    """Return rotation and velocity times strength at a time `since` uplift, while the pulse rises; V 3.2, H = 0."""
     _, left = _uplift(strength, shape)
     up, down = _parts(shape)
-    # Of an increasing exponential, its value at the end is taken out, so that spikes do not overflow.
+    # The final value of an increasing exponential is factored out, so that spikes do not overflow.
     rate, grown = duration * since, 2 * up * since
     nodes = (rate - grown, -rate - grown, 2 * down * since)
     lift = jnp.where(shape < 0, 1 - strength + strength * jnp.exp(down), jnp.exp(2 * up * (since - left)))
@@ -306,13 +306,13 @@ def _rising(since: Array, strength: Array, duration: Array, shape: Array) -> tup
 
 
 def _at_middle(strength: Array, duration: Array, shape: Array) -> tuple[Array, Array]:
-    """Rotation and velocity times strength at the peak of the pulse."""
+    """Return rotation and velocity times strength at the peak of the pulse."""
     _, left = _uplift(strength, shape)
     return _rising(left, strength, duration, shape)
 
 
 def _falling(since, middle, strength, duration, shape) -> tuple[Array, Array]:
-    """Rotation and velocity times strength at a time `since` the pulse's peak, from those at the peak; V 3.2."""
+    """Return rotation and velocity times strength at a time `since` the pulse's peak, from those at the peak; V 3.2."""
     angle, speed = middle
     up, down = _parts(shape)
     rate, grown = duration * since, -2 * down * since
@@ -329,7 +329,7 @@ def _falling(since, middle, strength, duration, shape) -> tuple[Array, Array]:
 
 
 def _at_end(strength: Array, duration: Array, shape: Array) -> tuple[Array, Array]:
-    """Rotation and velocity times strength at the end of the pulse, as if there were no ground below."""
+    """Return rotation and velocity times strength at the end of the pulse, as if there were no ground."""
     return _falling(jnp.full_like(duration, 0.5), _at_middle(strength, duration, shape), strength, duration, shape)
 
 
@@ -346,11 +346,11 @@ def _speed_at_end(strength, duration, shape):
 
 
 def _history(time: Array, strength: Array, duration: Array, shape: Array) -> tuple[Array, Array]:
-    """Rotation and velocity, not a number after the first return."""
+    """Return rotation and velocity, NaN after the first return."""
     rocks = (strength < 1) & (shape < _MOST_SHAPE)  # a perfect spike moves nothing
     strength = jnp.where(rocks, strength, 0.5)
     uplift, _ = _uplift(strength, shape)
-    # At the end of a piece, too, its slope by time is its own: of a tie `jnp.clip` would take half.
+    # At the end of a piece, too, the time derivative is its own; `jnp.clip` would halve it at a tie.
     since = jnp.where(time > uplift, jnp.where(time <= 0.5, time, 0.5) - uplift, 0.0)
     rising, middle = _rising(since, strength, duration, shape), _at_middle(strength, duration, shape)
     since = jnp.where(time > 0.5, jnp.where(time <= 1, time - 0.5, 0.5), 0.0)
@@ -375,7 +375,7 @@ def _falling_speed(since, angle, speed, strength, duration, shape):
 
 
 def _peak(strength: Array, duration: Array, shape: Array) -> tuple[Array, Array]:
-    """Time and size of the largest rotation."""
+    """Return time and size of the largest rotation."""
     rocks, wall = strength < 1, _safety_wall(duration, shape)
     lost = strength < wall
     inside = jnp.where(rocks & ~lost, strength, (1 + wall) / 2)

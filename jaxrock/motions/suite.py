@@ -127,7 +127,7 @@ class Suite(AbstractNamed):
     def __getitem__(self, number) -> AbstractMotion:
         """Return one of its motions. Where the number is traced, scenes of all records share their samples.
 
-        **Raises:** IndexError for a number out of range; ValueError for one that is not whole. Of a traced number:
+        **Raises:** IndexError for a number out of range, ValueError for one that is not whole. A traced number raises
         ValueError out of range, and for motions of several kinds, or derived from records other than by a factor.
         """
         if not is_traced(number):

@@ -1,10 +1,11 @@
-"""Maxima of a function whose values and slopes come in batches: many climbers at once, each at its own pace.
+"""Batched BFGS ascent: many climbers maximise a function whose values and slopes come in batches.
 
-Each climber has a BFGS matrix of its own; there are few dimensions. It tries one point in every round; whether that was
-good enough decides whether it has a new direction or a shorter step in the next one. So no round waits for anybody's
-line search, and a round is one call of one compiled program, whatever the climbers are at. (`optax.lbfgs` under
-`jax.vmap` goes through, too, and would wait for the longest line search; `optax.adam` takes many times as many points:
-benchmarks/inverse.md.)
+Each climber has its own BFGS matrix; dimensions are few. In every round a climber tries one point. If the gain is
+sufficient, it takes a new direction in the next round, else a shorter step. So no round waits for a line search, and a
+round is one call of one compiled program, in whatever state the climbers are.
+
+(`optax.lbfgs` under `jax.vmap` also works, but waits for the longest line search; `optax.adam` takes many times as many
+points: benchmarks/inverse.md.)
 """
 
 from collections.abc import Callable
@@ -13,20 +14,23 @@ from typing import NamedTuple
 import numpy as np
 
 _LONGEST_STEP = 1.0  # in the units of the points
-_SUFFICIENT = 1e-4  # of the gain that the slope promises
-_SHORTEST_STEP = 1e-9  # below which there is a jump
+_SUFFICIENT = 1e-4  # share of the gain that the slope predicts
+_SHORTEST_STEP = 1e-9  # a climber with a shorter step is at a jump, and ends
 
-# Rounds after which climbers so far below the best are given up: a compromise. Later, a fit takes up to twice as many
-# points, and finds a higher summit now and then; more starts do, too.
+# (rounds, depth): after so many rounds, climbers so far below the best are stopped. A compromise: with later limits a
+# fit takes up to twice as many points, and now and then finds a higher summit; more starts do, too.
 _HOPELESS = ((2, 10.0), (5, 4.0), (8, 1.5), (12, 0.5), (20, 0.1), (30, 0.02), (40, 0.005))
 _PATIENCE, _LEAST_GAIN = 12, 2e-6  # rounds in which a climber must gain so much; at a kink none would end otherwise
-_SAME = 0.01  # distance from a higher climber, in the units of the points, at which one is given up
-_NOWHERE = -1e300  # the value where there is none
+_SAME = 0.01  # distance from a higher climber, in the units of the points, at which one is stopped
+_NOWHERE = -1e300  # in place of a value that is not finite
 
 
 class Summits(NamedTuple):
-    """Where climbers arrived: (climbers, dimensions), (climbers,), and whether each is on a summit; and their paths,
-    points (rounds, climbers, dimensions) and values (rounds, climbers), which are not numbers after a climber's end."""
+    """The last points of all climbers, and their paths.
+
+    - `points`: (climbers, dimensions); `values`: (climbers,); `arrived`: whether each is on a summit.
+    - `path`: points (rounds, climbers, dimensions) and values (rounds, climbers), NaN after a climber's end.
+    """
 
     points: np.ndarray
     values: np.ndarray
@@ -50,9 +54,9 @@ def climb(
     - `starts`: (climbers, dimensions).
     - `free`: (climbers, dimensions), which coordinates of a climber may change.
     - `rounds`: at most.
-    - `promise`: gain that the slope promises for a whole step below which a climber has arrived.
-    - `group`: (climbers,) numbers; those of the same look for the same summit, so that climbers far below the best of
-      them, or beside a higher one, are given up.
+    - `promise`: a climber has arrived when the slope predicts a smaller gain than this for a whole step.
+    - `group`: (climbers,) numbers. Climbers of one group look for the same summit: those far below the best of the
+      group, or beside a higher one, are stopped.
 
     **Returns:** `Summits`.
     """
@@ -91,7 +95,7 @@ def climb(
         new = (new * free[active])[good]
         inverse[moved] = _bfgs(inverse[moved], trial[good] - points[moved], slopes[moved] - new)
         points[moved], values[moved], slopes[moved] = trial[good], higher[good], new
-        # The parabola through both values and the slope tells where to try next.
+        # The next trial is the top of the parabola through both values and the slope.
         bad = active[~good]
         shorter = expected[~good] / np.maximum(2 * (expected[~good] - gain[~good]), 1e-300)
         step[bad] *= np.clip(shorter, 0.1, 0.5)
@@ -100,7 +104,9 @@ def climb(
 
 
 def _bfgs(inverse: np.ndarray, move: np.ndarray, change: np.ndarray) -> np.ndarray:
-    """BFGS: the matrices with which the change of the slope gives the move; as they were where it is not concave."""
+    """Update the BFGS matrices, which map the change of the slope to the move; unchanged where the move is not
+    concave.
+    """
     product = np.sum(move * change, axis=1)
     concave = product > 1e-8 * np.linalg.norm(move, axis=1) * np.linalg.norm(change, axis=1)
     weight = 1 / np.where(concave, product, 1.0)
@@ -110,7 +116,7 @@ def _bfgs(inverse: np.ndarray, move: np.ndarray, change: np.ndarray) -> np.ndarr
 
 
 def _given_up(number: int, points: np.ndarray, values: np.ndarray, group: np.ndarray) -> np.ndarray:
-    """Which climbers are far below the best of their group after so many rounds, or beside a higher one."""
+    """Return which climbers are far below the best of their group after so many rounds, or beside a higher one."""
     alike = group[:, None] == group
     below = np.where(alike, values, -np.inf).max(axis=1) - values
     hopeless = np.any([(number >= rounds) & (below > depth) for rounds, depth in _HOPELESS], axis=0)
@@ -123,7 +129,7 @@ def _given_up(number: int, points: np.ndarray, values: np.ndarray, group: np.nda
 
 
 def _finite(values, slopes) -> tuple[np.ndarray, np.ndarray]:
-    """What is not a number is no place to climb to."""
+    """Replace values at points with NaN or infinity by `_NOWHERE`, and their slopes by zero."""
     values, slopes = np.array(values, float), np.array(slopes, float)
     bad = ~np.isfinite(values) | ~np.isfinite(slopes).all(axis=1)
     return np.where(bad, _NOWHERE, values), np.where(bad[:, None], 0.0, slopes)

@@ -1,4 +1,4 @@
-"""Quotients of exponentials and logarithms in which nothing cancels, with exact derivatives of every order."""
+"""Quotients of exponentials and logarithms without cancellation, with exact derivatives of every order."""
 
 import functools
 import math
@@ -17,13 +17,13 @@ _TERMS = 14
 def exponential_difference(*nodes: Real) -> Inexact[Array, "..."]:
     """Divided difference of e^x at the given nodes: positive, symmetric in them, and smooth where they meet.
 
-    With one node it is e^x, with two (e^x - e^y)/(x - y), with n + 1 equal ones e^x/n!. What a linear
-    system with the rates a, b, c... does at time t after a blow is t^n exponential_difference(a t, b t, c t...),
-    resonance included: solutions written with it have no removable singularities.
+    With one node it is e^x, with two (e^x - e^y)/(x - y), with n + 1 equal ones e^x/n!. The response of a linear system
+    with the rates a, b, c... at time t after a blow is t^n exponential_difference(a t, b t, c t...), resonance
+    included: solutions written with it have no removable singularities.
 
     **Arguments:**
 
-    - `nodes`: one or more arrays that broadcast; large negative ones are welcome, above 709 (float32: 88) it overflows.
+    - `nodes`: one or more arrays that broadcast. Large negative ones are safe; above 709 (float32: 88) it overflows.
 
     **Source:** McCurdy, Ng & Parlett (1984), accurate computation of divided differences of the exponential.
     """
@@ -45,8 +45,8 @@ def _difference(*nodes: Array) -> Array:
 
 @functools.partial(_difference.defjvp, symbolic_zeros=True)
 def _difference_jvp(nodes, tangents):
-    # A derivative with respect to a node repeats it: no formula is differentiated, so none loses digits. All of them
-    # side by side are one formula of small arrays, and not one each.
+    # The derivative by a node repeats the node: no formula is differentiated, so none loses digits. All derivatives are
+    # one formula of stacked arrays, not one formula each.
     value, nodes = _difference(*nodes), jnp.broadcast_arrays(*nodes)
     moving = [i for i, tangent in enumerate(tangents) if not isinstance(tangent, jax.custom_derivatives.SymbolicZero)]
     if not moving:
@@ -56,7 +56,7 @@ def _difference_jvp(nodes, tangents):
 
 
 def _sorted(nodes: tuple[Array, ...]) -> list[Array]:
-    """The nodes, largest first."""
+    """Return the nodes, largest first."""
     nodes = list(nodes)
     for end in range(len(nodes) - 1, 0, -1):
         for i in range(end):
@@ -65,13 +65,13 @@ def _sorted(nodes: tuple[Array, ...]) -> list[Array]:
 
 
 def _mean(upper: Array, lower: Array, value: Array) -> Array:
-    """Mean of e^x between two nodes; `value` is e^upper."""
+    """Return the mean of e^x between two nodes; `value` is e^upper."""
     gap = upper - lower
     return value * jnp.where(gap == 0, 1.0, -jnp.expm1(-gap) / jnp.where(gap == 0, 1.0, gap))
 
 
 def _merged(row: list[Array], nodes: list[Array]) -> Array:
-    """Difference at sorted nodes, from those without the last and without the first."""
+    """Return the difference at sorted nodes, from those without the last and without the first."""
     gap = nodes[0] - nodes[-1]
     close = gap < _CLOSE
     quotient = (row[0] - row[1]) / jnp.where(close, 1.0, gap)
@@ -80,7 +80,7 @@ def _merged(row: list[Array], nodes: list[Array]) -> Array:
 
 
 def _power_series(offsets: list[Array], centre: Array) -> Array:
-    """Difference at centre + offsets, at most `_CLOSE`/2: a sum of complete symmetric polynomials over factorials."""
+    """Return the difference at centre + offsets, at most `_CLOSE`/2: complete symmetric polynomials over factorials."""
     order = len(offsets) - 1
     polynomials = [jnp.ones_like(centre)] * len(offsets)  # of degree k in the first, first two, ... offsets
     total = polynomials[-1] / math.factorial(order)
@@ -93,12 +93,12 @@ def _power_series(offsets: list[Array], centre: Array) -> Array:
 
 
 def growth_ratio(x: Real) -> Inexact[Array, "..."]:
-    """(e^x - 1)/x, smooth through 0."""
+    """Return (e^x - 1)/x, smooth through 0."""
     return exponential_difference(x, 0.0)
 
 
 def logarithm_ratio(y: Real) -> Inexact[Array, "..."]:
-    """-log(1 - y)/y for y < 1, smooth through 0."""
+    """Return -log(1 - y)/y for y < 1, smooth through 0."""
     y = jnp.asarray(y)
     small = jnp.abs(y) < 0.05
     far = jnp.where(small, 0.5, y)

@@ -1,4 +1,4 @@
-"""Functions that vectorise: XLA's own, in double precision on CPUs, are calls of a scalar function."""
+"""Elementary functions that vectorise; XLA's own, in double precision on CPUs, call a scalar function."""
 
 import math
 
@@ -40,10 +40,10 @@ _COSINE = (
     3.95653834291857e-19,
 )
 
-# Of artanh(x)/x in x^2, |x| < 0.1725.
+# Coefficients of artanh(x)/x in x^2, |x| < 0.1725.
 _LOGARITHM = tuple(1 / (2 * k + 1) for k in range(11))
 
-# Of arctan(x)/x in x^2, |x| < tan(pi/8): interpolation as above, errors below 3e-18.
+# Coefficients of arctan(x)/x in x^2, |x| < tan(pi/8): interpolation as above, errors below 3e-18.
 _ARCTANGENT = (
     1.0,
     -0.3333333333333312,
@@ -59,11 +59,11 @@ _ARCTANGENT = (
     -0.017790395523288063,
 )
 
-# The first of these parts has few digits, and zeros behind them.
+# The first part has few significant digits, followed by zeros.
 _LOGARITHM_OF_2 = (0.6931471803691238, 1.9082149292705877e-10)
 _LOGARITHM_OF_2_IN_SINGLE = (0.693359375, -2.1219444005469057e-4)
 
-# Of exp(x), |x| < 0.347.
+# Coefficients of exp(x), |x| < 0.347.
 _EXPONENTIAL = tuple(1 / math.factorial(k) for k in range(14))
 
 
@@ -75,7 +75,7 @@ def _horner(coefficients: tuple[float, ...], x: Real) -> Real:
 
 
 def sine_cosine(x: Real) -> tuple[Real, Real]:
-    """Sine and cosine to rounding for |x| <= 1.78; beyond, the error grows (1e-11 at 3)."""
+    """Return sine and cosine to rounding for |x| <= 1.78; beyond, the error grows (1e-11 at 3)."""
     sine, cosine = _sine_cosine(x)
     return sine, cosine
 
@@ -86,7 +86,7 @@ def _near(x):
 
 
 def _turned(operation, numbers, changes):
-    """The change of sine and cosine, as an operation gives both."""
+    """Return the values and tangents of an operation that gives sine and cosine."""
     (sine, cosine), (moved,) = operation(*numbers), changes
     return [sine, cosine], [cosine * moved, -sine * moved]
 
@@ -96,25 +96,25 @@ _sine_cosine = Compound("sine_cosine", _near, _turned, results=2)
 
 @jax.jit
 def sine_ratio(x: Real) -> Real:
-    """sin(x)/x to rounding for |x| <= 1.78."""
+    """Return sin(x)/x to rounding for |x| <= 1.78."""
     return _horner(_SINE, x * x)
 
 
 @jax.jit
 def sine_lag(x: Real) -> Real:
-    """(x - sin(x))/x^3 to rounding for |x| <= 1.78."""
+    """Return (x - sin(x))/x^3 to rounding for |x| <= 1.78."""
     return -_horner(_SINE[1:], x * x)
 
 
 def sine_cosine_of_any(x: Real) -> tuple[Real, Real]:
-    """Sine and cosine of any angle, as exact as the angle itself is rounded."""
+    """Return sine and cosine of any angle, as exact as the rounding of the angle allows."""
     sine, cosine = _sine_cosine_of_any(x)
     return sine, cosine
 
 
 def _anywhere(x):
     half_turns = jnp.round(x * (1 / math.pi))
-    sine, cosine = _near((x - half_turns * math.pi) - half_turns * 1.2246467991473532e-16)  # the rest of pi
+    sine, cosine = _near((x - half_turns * math.pi) - half_turns * 1.2246467991473532e-16)  # the low part of pi
     sign = 1 - 2 * jnp.abs(half_turns - 2 * jnp.round(half_turns / 2))
     return [sign * sine, sign * cosine]
 
@@ -123,7 +123,7 @@ _sine_cosine_of_any = Compound("sine_cosine_of_any", _anywhere, _turned, results
 
 
 def logarithm(x: Real) -> Real:
-    """Natural logarithm of a positive normal number, to a few units of rounding."""
+    """Return the natural logarithm of a positive normal number, to a few units of rounding."""
     return _logarithm(x)[0]
 
 
@@ -147,7 +147,7 @@ _logarithm = Compound("logarithm", _logarithm_written, _logarithm_changed)
 
 
 def exponential(x: Real) -> Real:
-    """exp(x), to a few units of rounding; zero where it is no normal number."""
+    """Return exp(x), to a few units of rounding; zero where it would be subnormal."""
     return _exponential(x)[0]
 
 
@@ -162,7 +162,7 @@ def _exponential_written(x):
     def power_of_two(k):
         return jax.lax.bitcast_convert_type((k.astype(integer) + info.maxexp - 1) << info.nmant, x.dtype)
 
-    # In two parts: 2^1024 is no number, but exp(709) is.
+    # Two factors: 2^1024 overflows, but exp(709) does not.
     half = jnp.floor(power * 0.5)
     value = _horner(_EXPONENTIAL, rest) * power_of_two(half) * power_of_two(power - half)
     return [where(power < info.minexp, 0.0, where(x > math.log(2) * info.maxexp, jnp.inf, value))]
@@ -178,7 +178,7 @@ _exponential = Compound("exponential", _exponential_written, _exponential_change
 
 @jax.jit
 def exponential_less_one(x: Real) -> Real:
-    """exp(x) - 1, to a few units of rounding of the result."""
+    """Return exp(x) - 1, to a few units of rounding of the result."""
     x = jnp.asarray(x)
     near = x * _horner(tuple(c / (k + 1) for k, c in enumerate(_EXPONENTIAL)), x)
     return where(jnp.abs(x) < 0.346, near, exponential(x) - 1)
@@ -186,7 +186,7 @@ def exponential_less_one(x: Real) -> Real:
 
 @jax.jit
 def logarithm_of_one_and(x: Real) -> Real:
-    """log(1 + x), to a few units of rounding of the result, where 1 + x is a positive normal number."""
+    """Return log(1 + x), to a few units of rounding of the result, where 1 + x is a positive normal number."""
     ratio = x / (2 + x)
     near = 2 * ratio * _horner(_LOGARITHM, ratio * ratio)
     return where((x > -0.29) & (x < 0.41), near, logarithm(1 + x))
@@ -194,20 +194,20 @@ def logarithm_of_one_and(x: Real) -> Real:
 
 @jax.jit
 def tangent(x: Real) -> Real:
-    """tan(x), to a few units of rounding."""
+    """Return tan(x), to a few units of rounding."""
     sine, cosine = sine_cosine_of_any(x)
     return sine / cosine
 
 
 @jax.jit
 def _is_negative(x: Real) -> Bool[Array, "..."]:
-    """Return whether the sign is minus, of zeros too."""
+    """Return whether the sign is minus, also for negative zero."""
     return (x < 0) | ((x == 0) & (1 / x < 0))
 
 
 @jax.jit
 def arctangent_of(y: Real, x: Real) -> Real:
-    """The angle of the point (x, y), in [-pi, pi], to a few units of rounding; zeros have signs, as in C."""
+    """Return the angle of the point (x, y), in [-pi, pi], to a few units of rounding; zeros have signs, as in C."""
     high, wide = jnp.abs(y), jnp.abs(x)
     steep = high > wide
     small, large = where(steep, wide, high), where(steep, high, wide)
@@ -215,7 +215,7 @@ def arctangent_of(y: Real, x: Real) -> Real:
     beyond = share > 0.41421356237309503  # tan(pi/8)
     part = where(beyond, (share - 1) / (share + 1), share)
     angle = part * _horner(_ARCTANGENT, part * part)
-    # Quarters of pi, and what they lack.
+    # Each multiple of pi/4 is added with its rounding error.
     angle = where(beyond, (angle + 3.061616997868383e-17) + math.pi / 4, angle)
     angle = where(steep, (6.123233995736766e-17 - angle) + math.pi / 2, angle)
     angle = where(_is_negative(x), (1.2246467991473532e-16 - angle) + math.pi, angle)
@@ -225,13 +225,13 @@ def arctangent_of(y: Real, x: Real) -> Real:
 
 @jax.jit
 def arcsine(x: Real) -> Real:
-    """arcsin(x), to a few units of rounding."""
+    """Return arcsin(x), to a few units of rounding."""
     return arctangent_of(x, jnp.sqrt((1 - x) * (1 + x)))
 
 
 @jax.jit
 def hyperbolic_arctangent(x: Real) -> Real:
-    """artanh(x), to a few units of rounding; infinite at the ends."""
+    """Return artanh(x), to a few units of rounding; infinite at the ends."""
     size = jnp.abs(x)
     near = size * _horner(_LOGARITHM, x * x)
     inside = 0.5 * logarithm((1 + size) / (1 - where(size < 1, size, 0.0)))
@@ -242,7 +242,7 @@ def hyperbolic_arctangent(x: Real) -> Real:
 
 @jax.jit
 def hyperbolic_arcsine(x: Real) -> Real:
-    """arsinh(x), to a few units of rounding."""
+    """Return arsinh(x), to a few units of rounding."""
     size = jnp.abs(x)
     inside = jnp.minimum(size, 1e9)  # beyond, arsinh is log(2 x) to rounding
     root = jnp.sqrt(inside * inside + 1)
@@ -257,23 +257,23 @@ def hyperbolic_arcsine(x: Real) -> Real:
 
 @jax.jit
 def hyperbolic_sine(x: Real) -> Real:
-    """sinh(x), to a few units of rounding."""
+    """Return sinh(x), to a few units of rounding."""
     size = jnp.abs(x)
     grown, half = exponential_less_one(jnp.minimum(size, 20.0)), exponential(size / 2)
-    # Beyond, sinh is half of the exponential, which may be too large where sinh is not.
+    # Beyond 20, sinh is half of the exponential, which may overflow where sinh does not.
     value = where(size < 20, 0.5 * (grown + grown / (grown + 1)), 0.5 * half * half)
     return where(x > 0, value, where(x < 0, -value, x))
 
 
 @jax.jit
 def hyperbolic_cosine(x: Real) -> Real:
-    """cosh(x), to a few units of rounding."""
+    """Return cosh(x), to a few units of rounding."""
     half = exponential(jnp.abs(x) / 2)
     return 0.5 * half * half + 0.5 / half / half
 
 
 @jax.jit
 def hyperbolic_tangent(x: Real) -> Real:
-    """tanh(x), to a few units of rounding."""
+    """Return tanh(x), to a few units of rounding."""
     grown = exponential_less_one(2 * jnp.minimum(jnp.abs(x), 30.0))
     return where(x < 0, -grown, grown) / (grown + 2)

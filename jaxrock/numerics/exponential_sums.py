@@ -1,7 +1,7 @@
-"""Sums of exponentials and a polynomial on [0, 1]: their first way out of a band and their maximum, certified.
+"""Sums of exponentials and a polynomial on [0, 1]: their certified first exit from a band, and their maximum.
 
-Every quantity of a linear system under a polynomial load is such a curve. Its derivatives are bounded by the sizes
-of its terms, so that a march in strides that cannot hold a zero finds every event, however fast some terms vibrate.
+Every quantity of a linear system under a polynomial load is such a curve. Its derivatives are bounded by the sizes of
+its terms. A march in strides that provably contain no zero finds every event, however fast some terms vibrate.
 """
 
 import equinox as eqx
@@ -19,11 +19,12 @@ _MOST_STRIDES = 10_000
 
 
 def powers(base: Inexact[ArrayLike, "..."], count: int) -> Inexact[Array, "count ..."]:
-    """Powers 0 to count - 1, along a new first axis."""
+    """Return the powers 0 to count - 1, along a new first axis."""
     base = jnp.asarray(base)
     exponent = np.arange(count).reshape(-1, *[1] * base.ndim)
     found = jnp.ones((count, *base.shape), base.dtype)
-    # By squares, each where its bit is set: one loop for XLA, which makes one of each table that is put together.
+    # By repeated squaring, selected by the bits of the exponent: one loop for XLA, which makes a loop of every
+    # concatenation.
     for bit in range((count - 1).bit_length()):
         found = found * jnp.where(exponent >> bit & 1 == 1, base, 1)
         base = base * base
@@ -31,7 +32,7 @@ def powers(base: Inexact[ArrayLike, "..."], count: int) -> Inexact[Array, "count
 
 
 def _derivatives(count: int) -> np.ndarray:
-    """Matrices that take a polynomial's coefficients to those of its derivatives, orders 0 to 3."""
+    """Return matrices that map a polynomial's coefficients to those of its derivatives, orders 0 to 3."""
     first = np.diag(np.arange(1.0, count), 1)
     return np.stack([np.linalg.matrix_power(first, order) for order in range(4)])
 
@@ -42,35 +43,35 @@ class Curve(eqx.Module):
     amplitudes: Complex[Array, "*rows modes"]
     rates: Complex[Array, "*rows modes"]
     coefficients: Inexact[Array, "*rows terms"]
-    errors: Inexact[Array, "*rows modes"]  # what rounding may have changed in each mode at 0
+    errors: Inexact[Array, "*rows modes"]  # bound of the rounding error of each mode at 0
 
     def jet(self, x: Scalar) -> Inexact[Array, "three"]:
-        """Value, slope and curvature."""
+        """Return value, slope and curvature."""
         count = self.coefficients.size
         waves = self.amplitudes * jnp.exp(self.rates * x) * powers(self.rates, 3)
         smooth = jnp.asarray(_derivatives(count)[:3]) @ self.coefficients
         return smooth @ powers(x, count) + waves.real.sum(axis=1)
 
     def ceiling(self) -> Scalar:
-        """A bound of the size on [0, 1]."""
+        """Return a bound of the absolute value on [0, 1]."""
         sizes = jnp.abs(self.amplitudes) * jnp.exp(jnp.maximum(self.rates.real, 0.0))
         return sizes.sum() + jnp.abs(self.coefficients).sum()
 
 
 class _Tables(eqx.Module):
-    """What a march along a curve needs at every point, as products with few exponentials and powers."""
+    """Precomputed tables for the points of a march along a curve, which then needs few exponentials and powers."""
 
     rates: Complex[Array, " modes"]
     waves: Complex[Array, "three modes"]  # value, slope, curvature
     sizes: Inexact[Array, "three modes"]  # of value, second and third derivative
     smooth: Inexact[Array, "three terms"]
     largest: Inexact[Array, "two terms"]  # of second and third derivative
-    errors: Inexact[Array, "two modes"]  # of value and slope, from rounding: of modes, which fade with them
-    floor: Inexact[Array, " two"]  # and of what stays
+    errors: Inexact[Array, "two modes"]  # rounding errors of value and slope, from the modes, with which they decay
+    floor: Inexact[Array, " two"]  # constant rounding errors of value and slope
 
     @classmethod
     def of(cls, curve: Curve, level: Scalar) -> "_Tables":
-        """Tables of a curve that is compared with numbers of the size `level`."""
+        """Make the tables of a curve that is compared with numbers of the size `level`."""
         amplitudes, rates = curve.amplitudes, curve.rates
         turned = jnp.stack([amplitudes * rates**k for k in range(4)])
         smooth = _derivatives(curve.coefficients.size) @ curve.coefficients
@@ -88,17 +89,17 @@ class _Tables(eqx.Module):
         )
 
     def noise(self, turned: Complex[Array, " modes"]) -> Inexact[Array, " two"]:
-        """What rounding may have changed in value and slope, where the modes have grown and turned so much."""
+        """Return bounds of the rounding errors of value and slope; `turned` are the modes' growth factors."""
         return self.errors @ jnp.abs(turned) + self.floor
 
 
 def _partial_sums(terms: Inexact[Array, "*rows modes"]) -> Inexact[Array, "*rows sums"]:
-    """Sums of the first 0, 1, ... modes."""
+    """Return the sums of the first 0, 1, ... modes."""
     return terms @ np.tri(terms.shape[-1] + 1, terms.shape[-1], -1).T
 
 
 class _View:
-    """A curve at x, and bounds of it on [x, x + radius], from which lengths without a crossing follow."""
+    """A curve at x, with bounds on [x, x + radius] from which lengths without a crossing follow."""
 
     def __init__(self, tables: _Tables, x: Scalar, radius: Scalar):
         count = tables.smooth.shape[1]
@@ -108,12 +109,12 @@ class _View:
         sizes, largest = tables.sizes * grown, tables.largest @ powers(x + radius, count)
         self.value, self.slope, self.curvature = smooth + terms.sum(1)
         self.third = largest[1] + sizes[2].sum()
-        # The curve without its fastest modes, and how far these swing, for every choice of what is fast.
+        # The curve without its fastest modes, and the swing of these, for every split into slow and fast.
         self.slow, self.drift = smooth[:2, None] + _partial_sums(terms[:2])
         swing, bend = _partial_sums(sizes[:2])
         self.swing, self.bend = swing[-1] - swing, largest[0] + bend
         self.noise = tables.noise(turned)
-        # What cannot leave the noise may be passed over.
+        # A length within which the curve stays below the rounding noise may be skipped.
         still = jnp.maximum(jnp.abs(self.slope), self.noise[1])
         within = _ratio(self.noise[0], still), jnp.sqrt(_ratio(self.noise[0], self.curvature))
         self.within = jnp.minimum(jnp.minimum(*within), jnp.cbrt(_ratio(self.noise[0], self.third)))
@@ -121,12 +122,12 @@ class _View:
     def clear(self, level: Scalar, sign: float) -> tuple[Flag, Scalar]:
         """Return whether the curve touches the level, and a length on which it stays on this side (sign 1: above it).
 
-        The longest of many: by parabolas below the slower modes, less the swing of the faster ones. It is zero where
-        the curve touches the level and leaves this side, certainly in spite of rounding.
+        The length is the longest of many, each from a parabola below the slower modes, less the swing of the faster
+        ones. It is zero where the curve touches the level and leaves this side with certainty despite rounding.
         """
         value, slope = sign * (self.value - level), sign * self.slope
         touching = value <= self.noise[0]
-        # From zero: slope + curvature x/2 - third x^2/6.
+        # A start at zero: slope + curvature x/2 - third x^2/6 stays positive.
         up = jnp.where(slope <= self.noise[1], 0.0, slope)
         leaving = _below_parabola(up, sign * self.curvature / 2, self.third / 3)
         leaving = jnp.where(slope < -self.noise[1], 0.0, jnp.maximum(leaving, self.within))
@@ -137,7 +138,7 @@ class _View:
 
 
 def _below_parabola(value: Values, slope: Values, fall: Values) -> Values:
-    """Lengths on which value + slope x - fall x^2/2 stays positive, for a value of 0 or more."""
+    """Return lengths on which value + slope x - fall x^2/2 stays positive, for a value of 0 or more."""
     root = jnp.sqrt(slope**2 + 2 * fall * value)
     rising = slope > 0
     above = jnp.where(rising, slope + root, 2 * value)
@@ -147,15 +148,15 @@ def _below_parabola(value: Values, slope: Values, fall: Values) -> Values:
 
 
 def _ratio(part: Scalar, whole: Scalar) -> Scalar:
-    """|part/whole|, or infinity."""
+    """Return |part/whole|, or infinity."""
     return jnp.where(whole == 0, jnp.inf, jnp.abs(part / jnp.where(whole == 0, 1.0, whole)))
 
 
 def first_exit(curve: Curve, low: Scalar, high: Scalar, end: Scalar) -> tuple[Scalar, Flag, Flag]:
-    """Where on [0, end] the curve first leaves the band, or `end`; whether below, whether above.
+    """Return the point of [0, end] at which the curve first leaves the band, or `end`; whether below, whether above.
 
-    A curve that starts on an edge must turn outward to leave. If the strides do not come to an end the march stops
-    early, with no hit: what lies before is certain. It has no derivatives.
+    A curve that starts on an edge must turn outward to leave. At the limit of strides the march stops early, without a
+    hit: the curve is certainly inside before that point. The result has no derivatives.
     """
     curve, low, high, end = jax.lax.stop_gradient((curve, low, high, end))
     tables = _Tables.of(curve, jnp.maximum(jnp.abs(low), jnp.abs(high)))
@@ -178,7 +179,7 @@ def first_exit(curve: Curve, low: Scalar, high: Scalar, end: Scalar) -> tuple[Sc
 
 
 def highest(curve: Curve, best: Scalar, end: Scalar) -> tuple[Scalar, Flag]:
-    """The largest value on [0, end], or `best` if that is larger, with derivatives; whether the search was finished."""
+    """Return the largest of `best` and the values on [0, end], with derivatives, and whether the search finished."""
     still, least, last = jax.lax.stop_gradient((curve, best, end))
     tables, eps = _Tables.of(still, least), jnp.finfo(last.dtype).eps
 
@@ -195,7 +196,7 @@ def highest(curve: Curve, best: Scalar, end: Scalar) -> tuple[Scalar, Flag]:
         return jnp.minimum(x + stride, last), jnp.minimum(4 * stride, last), least, place, count + 1
 
     nowhere = still.ceiling() <= least
-    # High from the start: else all ripples of a rising curve would be records.
+    # Start with a high value: otherwise every ripple of a rising curve would be a new maximum.
     first = _top_of_steady(still, last)
     value = still.jet(first)[0]
     place = jnp.where(~nowhere & (value > least), first, -1.0)
@@ -204,22 +205,22 @@ def highest(curve: Curve, best: Scalar, end: Scalar) -> tuple[Scalar, Flag]:
     x, _, least, place, _ = jax.lax.while_loop(
         lambda carry: (carry[0] < last) & (carry[4] < _MOST_STRIDES), step, start
     )
-    # The top moves, too, which second derivatives feel.
+    # The top moves with the parameters, which matters for second derivatives.
     top = jnp.where(place > 0, implicit(_to_top, jnp.maximum(place, 0.0), curve), 0.0)
     of_end, of_top = jax.vmap(curve.jet)(jnp.stack([end, top]))[:, 0]
-    # Where the curve still rises at its end, its top is next to that, and by rounding may be the higher of the two.
+    # A curve that still rises at its end has its top found just before, and by rounding that may be the higher value.
     at_end = ~nowhere & (of_end >= least - tables.noise(jnp.exp(tables.rates * last))[0])
     return jnp.where(at_end, of_end, jnp.where(place >= 0, of_top, best)), x >= last
 
 
 def _to_top(curve: Curve, x: Scalar) -> Scalar:
-    """How far it is to the top of a curve; none where it only rises or falls."""
+    """Return Newton's step to the top of a curve; zero where the curve is not concave."""
     _, slope, bend = curve.jet(x)
     return jnp.where(bend < 0, slope / jnp.where(bend < 0, bend, 1.0), 0.0)
 
 
 def _top_of_steady(curve: Curve, end: Scalar) -> Scalar:
-    """Nearly where on [0, end] the curve without its vibrations is highest."""
+    """Return approximately the point of [0, end] at which the curve without its oscillating modes is highest."""
     amplitudes, rates = jnp.where(curve.rates.imag == 0, curve.amplitudes, 0.0).real, curve.rates.real
     count = curve.coefficients.size
     smooth = (_derivatives(count) @ curve.coefficients)[:3]

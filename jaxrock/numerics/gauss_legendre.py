@@ -1,4 +1,4 @@
-"""Gauss-Legendre quadrature: its nodes and weights."""
+"""Nodes and weights of Gauss-Legendre quadrature."""
 
 import numpy as np
 from jaxtyping import Float
@@ -8,7 +8,7 @@ from jaxrock._settings import kept_by_precision
 
 @kept_by_precision
 def gauss_legendre(count: int) -> tuple[Float[np.ndarray, " count"], Float[np.ndarray, " count"]]:
-    """Nodes and weights on [-1, 1], exact for polynomials of degree 2 count - 1; the arrays are read-only."""
+    """Return nodes and weights on [-1, 1], exact for polynomials of degree 2 count - 1; the arrays are read-only."""
     nodes, weights = np.polynomial.legendre.leggauss(count)
     nodes.flags.writeable = weights.flags.writeable = False
     return nodes, weights
@@ -16,7 +16,7 @@ def gauss_legendre(count: int) -> tuple[Float[np.ndarray, " count"], Float[np.nd
 
 @kept_by_precision
 def gauss_legendre_of_unit(count: int) -> tuple[Float[np.ndarray, " count"], Float[np.ndarray, " count"]]:
-    """The same on [0, 1]."""
+    """Return nodes and weights on [0, 1]; the arrays are read-only."""
     nodes, weights = gauss_legendre(count)
     nodes, weights = (nodes + 1) / 2, weights / 2
     nodes.flags.writeable = weights.flags.writeable = False

@@ -1,7 +1,7 @@
-"""Nonlinear least squares from scattered starts, window after window, and the covariance of what they find.
+"""Nonlinear least squares from scattered starts, over growing windows of data, and the covariance of the result.
 
-The steps are those of SciPy (a region of trust that bounds reflect); the windows, the holding and the covariance are
-done here.
+SciPy takes the steps (a trust region with reflection at the bounds). This module adds the windows, the prior that holds
+a start, and the covariance.
 """
 
 import functools
@@ -11,17 +11,17 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-_MOST_STEPS, _FEW_STEPS = 100, 12  # of the last window, and of one on the way; one that is refused counts
-_TIGHT, _LOOSE = 1e-10, 1e-2  # relative gain in a step, below which it is the last one there
-_STILL = 1e-9  # of the size of all parameters: a step that is none
-_UNDETERMINED = 1e10  # variance of what the data do not tell, in squares of its natural size
-_TO_THE_BOUND = 0.9  # share of the way to a bound that a start is scattered
+_MOST_STEPS, _FEW_STEPS = 100, 12  # of the last window, and of an earlier one; refused steps count
+_TIGHT, _LOOSE = 1e-10, 1e-2  # relative gain of a step below which the descent ends
+_STILL = 1e-9  # relative size of a step that counts as zero
+_UNDETERMINED = 1e10  # variance of undetermined combinations of parameters, in squares of their natural size
+_TO_THE_BOUND = 0.9  # largest share of the way to a bound by which a start is scattered
 
 
 class Problem(NamedTuple):
-    """What is to be made small: `at(point, samples)` gives residuals (n,) and their derivatives.
+    """The residuals to minimise: `at(point, samples)` gives residuals (n,) and their derivatives.
 
-    Residuals past the first `samples` are zero; of a point that has no result they are infinite. `scale`, `lower` and
+    Residuals past the first `samples` are zero; for a point without a result they are infinite. `scale`, `lower` and
     `upper` are (parameters,): their natural size, and the open interval that they stay in.
     """
 
@@ -32,9 +32,9 @@ class Problem(NamedTuple):
 
 
 class Progression(NamedTuple):
-    """Windows of the data, one after the other; in all but the last a start is held near where it began.
+    """Windows of the data, one after the other; in all but the last a prior holds a start near its first point.
 
-    It is held as if by a measurement with the relative error `spread`, beside data with errors of size `noise`.
+    The prior acts as a measurement with the relative error `spread`, beside data with errors of size `noise`.
     """
 
     windows: tuple[int, ...]
@@ -43,7 +43,7 @@ class Progression(NamedTuple):
 
 
 class End(NamedTuple):
-    """Where a start has come to: its point, residuals and derivatives there, and whether that is a minimum."""
+    """The end of one descent: its point, residuals and derivatives there, and whether that is a minimum."""
 
     point: Float[np.ndarray, " parameters"]
     residuals: Float[np.ndarray, " n"]
@@ -57,7 +57,7 @@ class End(NamedTuple):
 
 
 class Minimum(NamedTuple):
-    """The least sum of squares of all starts, and the share of them that came to it."""
+    """The least sum of squares of all starts, and the share of the starts that reached it."""
 
     point: Float[np.ndarray, " parameters"]
     residuals: Float[np.ndarray, " n"]
@@ -67,21 +67,21 @@ class Minimum(NamedTuple):
 
 
 class Covariance(NamedTuple):
-    """Of estimates by least squares: for independent residuals, and for correlated ones."""
+    """Covariance of least-squares estimates: for independent residuals, and for correlated ones."""
 
     independent: Float[np.ndarray, "parameters parameters"]
     robust: Float[np.ndarray, "parameters parameters"]
-    scatter: float  # of residuals, by degrees of freedom
+    scatter: float  # standard deviation of the residuals, by degrees of freedom
     correlation: float  # of neighbouring residuals
 
 
 def least_squares(problem: Problem, first: np.ndarray, progression: Progression, starts: int, seed: int) -> Minimum:
-    """The least sum of squares that is found from scattered starts, window after window.
+    """Find the least sum of squares from scattered starts, window after window.
 
     **Arguments:**
 
     - `first`: (parameters,) the first start; the others lie around it by the spread of the progression.
-    - `starts`: how many. `seed`: of their random numbers.
+    - `starts`: their number. `seed`: of their random numbers.
 
     **Source:** Branch, Coleman & Li (1999), by SciPy.
     """
@@ -90,14 +90,14 @@ def least_squares(problem: Problem, first: np.ndarray, progression: Progression,
     ends = [_through_windows(problem, point, progression) for point in points]
     costs = np.array([end.cost for end in ends])
     best = ends[int(np.argmin(costs))]
-    # What is so near is the same minimum, to a thirtieth of the standard errors.
+    # Ends with so similar costs count as the same minimum, to a thirtieth of the standard errors.
     near = costs <= best.cost * (1 + 1e-6) + 1e-3 * progression.noise**2
     share = float(np.mean(near)) if np.isfinite(best.cost) else 0.0
     return Minimum(*best, share)
 
 
 def _through_windows(problem: Problem, point: np.ndarray, progression: Progression) -> End:
-    """Where a start comes to, from the first window to the last."""
+    """Descend from a start, from the first window to the last."""
     *early, last = progression.windows
     for samples in early:
         point = _descend(problem, point, samples, progression.noise / progression.spread, _FEW_STEPS, _LOOSE).point
@@ -105,16 +105,16 @@ def _through_windows(problem: Problem, point: np.ndarray, progression: Progressi
 
 
 def _inside(problem: Problem, points: np.ndarray, steps: np.ndarray) -> np.ndarray:
-    """Points after steps, each parameter no further than most of its way to a bound."""
+    """Add steps to points, each parameter moving no further than most of its way to a bound."""
     room = np.where(steps > 0, problem.upper - points, problem.lower - points)
     return points + np.where(np.abs(steps) < _TO_THE_BOUND * np.abs(room), steps, _TO_THE_BOUND * room)
 
 
 def _descend(problem: Problem, begun: np.ndarray, samples: int, hold: float, most: int, enough: float) -> End:
-    """The minimum that SciPy finds from one start in a window. `hold`: by how much it is held where it began."""
+    """Run SciPy's descent from one start in a window. `hold`: weight of the prior that holds it near its start."""
     from scipy.optimize import least_squares
 
-    @functools.lru_cache(maxsize=2)  # residuals and derivatives come together and are asked for apart
+    @functools.lru_cache(maxsize=2)  # computed together, but SciPy asks for each separately
     def at(place: tuple[float, ...]):
         residuals, jacobian = problem.at(np.array(place), samples)
         return residuals, np.nan_to_num(jacobian)
@@ -130,7 +130,7 @@ def _descend(problem: Problem, begun: np.ndarray, samples: int, hold: float, mos
     first, first_slopes = at(tuple(begun))
     has_result = bool(np.isfinite(first).all())
     if not has_result or not np.any(first @ first_slopes):
-        return End(begun, first, first_slopes, has_result)  # given up, or there is nowhere to go
+        return End(begun, first, first_slopes, has_result)  # no result there, or the gradient is zero
     bounds = problem.lower, problem.upper
     found = least_squares(
         residuals, begun, slopes, bounds, x_scale=problem.scale, ftol=enough, xtol=_STILL, gtol=None, max_nfev=most
@@ -140,15 +140,15 @@ def _descend(problem: Problem, begun: np.ndarray, samples: int, hold: float, mos
 
 
 def covariance(minimum: Minimum, scale: np.ndarray, scatter_is_known: bool) -> Covariance:
-    """Covariance of the point of least squares, from weighted residuals and their derivatives there.
+    """Return the covariance of a least-squares point, from weighted residuals and their derivatives there.
 
     **Arguments:**
 
-    - `scale`: (parameters,) natural sizes: what is not told at all gets a variance of 1e10 or more of their squares.
+    - `scale`: (parameters,) natural sizes: undetermined combinations get a variance of 1e10 or more of their squares.
     - `scatter_is_known`: whether residuals were weighted by the inverse of their true standard deviation.
 
-    **Source:** for correlated residuals the covariance of ordinary least squares under errors that are stationary: each
-    a combination of those before it (Yule & Walker, by Brockwell & Davis 1991, 8.1), of an order after Akaike (1974).
+    **Source:** for correlated residuals, the covariance of ordinary least squares under stationary errors. They are
+    autoregressive (Yule & Walker, by Brockwell & Davis 1991, 8.1), of an order after Akaike (1974).
     """
     residuals, slopes = minimum.residuals, np.nan_to_num(minimum.jacobian) * scale
     size, count = slopes.shape
@@ -158,7 +158,7 @@ def covariance(minimum: Minimum, scale: np.ndarray, scatter_is_known: bool) -> C
     values, vectors = np.linalg.eigh(slopes.T @ slopes)
     floor = 1e-14 * max(values.max(), 1e-280)
     undetermined = vectors[:, values <= floor]
-    # However small the residuals are: they say nothing about what does not show in them.
+    # Independent of the size of the residuals: they say nothing about combinations that do not change them.
     unknown = _UNDETERMINED * np.outer(scale, scale) * (undetermined @ undetermined.T)
     values = np.maximum(values, floor)
     inverse = (vectors / values) @ vectors.T
@@ -175,9 +175,9 @@ def covariance(minimum: Minimum, scale: np.ndarray, scatter_is_known: bool) -> C
 
 
 def _correlations(residuals: np.ndarray) -> np.ndarray:
-    """Of residuals with those so many places later, from 1 on down to where they vanish.
+    """Return the autocorrelations of residuals at lags 0, 1, ... until they vanish.
 
-    Each is taken as a combination of those before it, of the order that explains most for its number of terms.
+    The residuals are taken as an autoregressive process of the order with the least Akaike criterion.
     """
     size, most = residuals.size, min(12, residuals.size // 10)
     powers = np.array([np.sum(residuals[lag:] * residuals[: size - lag]) for lag in range(most + 1)])
@@ -192,7 +192,7 @@ def _correlations(residuals: np.ndarray) -> np.ndarray:
         merit = size * np.log(max(left, 1e-300)) + 2 * order  # Akaike
         if merit < best:
             best, terms = merit, combination
-    correlations = list(powers[: terms.size + 1])  # of no order at all: none but with itself
+    correlations = list(powers[: terms.size + 1])  # order zero: only lag 0
     while terms.size and len(correlations) < size - 1 and np.max(np.abs(correlations[-terms.size :])) > 1e-3:
         correlations.append(float(terms @ correlations[: -terms.size - 1 : -1]))
     return np.array(correlations)

@@ -1,4 +1,4 @@
-"""Looking up a value by a number that differs from lane to lane."""
+"""Lookup of a value by an index that differs from lane to lane."""
 
 import jax
 import jax.numpy as jnp
@@ -10,7 +10,7 @@ _FEW = 8
 
 
 def pick(values: Shaped[Array, " n"], index: Int[Array, ""] | int) -> Shaped[Array, ""]:
-    """`values[index]`; of a few values by comparison, because looking up does not vectorise."""
+    """Return `values[index]`; few values are compared one by one, because a gather does not vectorise."""
     if values.shape[0] > _FEW:
         return values[index]
     value = values[0]
@@ -20,7 +20,7 @@ def pick(values: Shaped[Array, " n"], index: Int[Array, ""] | int) -> Shaped[Arr
 
 
 def count_up_to(values: Shaped[Array, " n"], x: Shaped[ArrayLike, ""]) -> Int[Array, ""]:
-    """How many of some sorted values are not larger than x; without derivatives."""
+    """Return the number of sorted values that are not larger than x, without derivatives."""
     values, x = jax.lax.stop_gradient((values, jnp.asarray(x)))
     if values.shape[0] <= _FEW:
         return jnp.sum(values <= x, dtype=jnp.int32)
@@ -38,7 +38,7 @@ def count_up_to(values: Shaped[Array, " n"], x: Shaped[ArrayLike, ""]) -> Int[Ar
 def stretch_from(
     starts: Shaped[Array, " n"], x: Shaped[Array, ""], upward: Bool[Array, ""]
 ) -> tuple[Int[Array, ""], Shaped[Array, ""], Bool[Array, ""]]:
-    """Return the interval between sorted numbers that holds x when moving upward or downward, and where it ends.
+    """Return the interval between sorted numbers that holds x when moving upward or downward, and its end.
 
     **Arguments:** `starts`: starts of the intervals, 0 or more, the first 0.
 

@@ -1,5 +1,6 @@
-"""The one root of a polynomial between two points, by Newton's iterations: in lanes, where a division takes as long as
-ten products.
+"""The only root of a polynomial between two points, by Newton's iterations, in lanes.
+
+There a division takes as long as ten products.
 """
 
 import math
@@ -15,23 +16,26 @@ from jaxrock.numerics.xla_cpu import keep
 
 Scalar = Inexact[Array, ""]
 
-_MORE = 6  # changes of a root in full degree
+_MORE = 6  # largest number of Newton steps in full degree
 
 
 def _settled(x: Scalar) -> float:
-    """The change of a root, as a share of it, after which there are no more: the next is its square, times what may be
-    1e4 where the slope is small."""
+    """Return the relative change of a root after which Newton's iteration stops.
+
+    The next relative change is the square of this one, times a factor of up to 1e4 where the slope is small.
+    """
     return max(1e-10, math.sqrt(4e-5 * float(jnp.finfo(x.dtype).eps)))
 
 
 def is_found(x: Scalar, change: Scalar, share: float = 1e-7) -> Bool[Array, ""]:
-    """Return whether the last change of a root was small enough for it to be one: such a share of it, or in single
-    precision what is left there."""
+    """Return whether the last relative change of a root is at most `share`, or in single precision 80 units of
+    rounding.
+    """
     return change <= max(share, 80 * float(jnp.finfo(x.dtype).eps)) * x
 
 
 def _guess(values: tuple[Scalar, Scalar], slopes: tuple[Any, Any]) -> Scalar:
-    """The root in [0, 1] of a parabola or, if the `slopes` at both ends are known, of a cubic (about)."""
+    """Return the root in [0, 1] of a parabola or, if the `slopes` at both ends are known, approximately of a cubic."""
     sign = where(values[0] > 0, 1.0, -1.0)
     value, slope, fall = sign * values[0], sign * slopes[0], sign * values[1]
     curvature = fall - value - slope
@@ -48,7 +52,7 @@ def _guess(values: tuple[Scalar, Scalar], slopes: tuple[Any, Any]) -> Scalar:
 
 
 def root_between(degrees, terms: list[Scalar], start: Scalar, end: Scalar, values, slopes):
-    """The one root of a polynomial in [start, end], and Newton's last change of it; `values`, `slopes`: at both ends.
+    """Return the only root of a polynomial in [start, end], and Newton's last change; `values`, `slopes`: at both ends.
 
     The first iterations take polynomials of these `degrees`: they need not be exact.
     """
@@ -61,7 +65,7 @@ def root_between(degrees, terms: list[Scalar], start: Scalar, end: Scalar, value
         change = value / slope
         return jnp.clip(x - change, start, end), jnp.abs(change)
 
-    for degree in degrees if order > 10 else (order,):  # the short steps of records
+    for degree in degrees if order > 10 else (order,):  # low orders belong to the short steps of records
         x, change = nearer(x, degree)
 
     def unsettled(carry):

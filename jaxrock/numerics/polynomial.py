@@ -1,7 +1,7 @@
 """Polynomials on [0, 1] as lists of coefficients, and their first sign change, certified.
 
-A list entry is a scalar (or, under vmap, one per lane). What is done with all coefficients of a list is one operation
-of JAX (`compound`), which is written out where it is compiled.
+A list entry is a scalar (or, under vmap, one per lane). An operation on all coefficients of a list is one JAX primitive
+(`compound`), which is expanded at lowering.
 """
 
 import functools
@@ -23,7 +23,7 @@ Flag = Bool[Array, ""]
 
 
 def rescaled(coefficients: list[Scalar], length: Scalar) -> list[Scalar]:
-    """Coefficients in x/length from those in x."""
+    """Return the coefficients in x/length from those in x."""
     return _rescaled(length, *coefficients)
 
 
@@ -39,7 +39,7 @@ _rescaled = Compound("rescaled", _rescaled_written, results=lambda count: count 
 
 
 def _polynomial(x, *coefficients, derivatives: int):
-    """Value and derivatives; those of a degree that it does not have are zero."""
+    """Return value and derivatives; derivatives above the degree are zero."""
     *lower, first = coefficients or [jnp.zeros_like(x)]
     values = [first]
     for c in reversed(lower):
@@ -68,13 +68,15 @@ polynomial = Compound("polynomial", _polynomial, _polynomial_changed, lambda _, 
 
 
 def jet(coefficients: list[Scalar], x: Scalar, derivatives: int) -> list[Scalar]:
-    """Value and the first derivatives of a polynomial at x."""
+    """Return value and the first derivatives of a polynomial at x."""
     return polynomial(x, *coefficients, derivatives=derivatives)
 
 
 def _total(terms: list) -> Any:
-    """Their sum, from the middle outwards: in products of series the outer terms are the newest, and the sum of the
-    others need not wait for them."""
+    """Sum the terms from the middle outwards.
+
+    In products of series the outer terms are computed last, and the sum of the others need not wait for them.
+    """
     middle = (len(terms) - 1) / 2
     first, *rest = sorted(range(len(terms)), key=lambda place: abs(place - middle))
     return sum((terms[place] for place in rest), start=terms[first])
@@ -98,19 +100,21 @@ _products = Compound("sum_of_products", _sum_of_products, _sum_of_products_chang
 
 
 def sum_of_products(first: Sequence, second: Sequence) -> Scalar:
-    """The sum of the products of numbers of two lists of one length."""
+    """Return the sum of the products of two lists' entries; the lists have one length."""
     return _products(*first, *second)[0]
 
 
 def product_term(first: list, second: list, k: int) -> Any:
-    """Coefficient k of a product of series, of which coefficients may be missing (zero)."""
+    """Return coefficient k of a product of series; missing coefficients (None) are zero."""
     pairs = [(first[j], second[k - j]) for j in range(min(k, len(first) - 1) + 1) if second[k - j] is not None]
     return sum_of_products(*map(list, zip(*pairs))) if pairs else 0.0
 
 
 def tangent(coefficients: list[Scalar], x: Scalar) -> tuple[Scalar, Scalar]:
-    """Value and slope of a polynomial of degree 1 or more at x: even and odd powers side by side, where the last digit
-    does not matter."""
+    """Return value and slope of a polynomial of degree 1 or more at x.
+
+    Even and odd powers are evaluated side by side, for use where the last digit does not matter.
+    """
     square = x * x
     even, even_slope = jet(coefficients[::2], square, 1)
     odd, odd_slope = jet(coefficients[1::2], square, 1)
@@ -118,7 +122,7 @@ def tangent(coefficients: list[Scalar], x: Scalar) -> tuple[Scalar, Scalar]:
 
 
 def shifted(coefficients: list[Scalar], by: Scalar) -> list[Scalar]:
-    """Coefficients about a point `by` further on (synthetic division)."""
+    """Return the coefficients about a point `by` further on (synthetic division)."""
     terms = list(coefficients)
     for start in range(len(terms) - 1):
         for j in range(len(terms) - 2, start - 1, -1):
@@ -127,20 +131,20 @@ def shifted(coefficients: list[Scalar], by: Scalar) -> list[Scalar]:
 
 
 def derivative(coefficients: list[Scalar]) -> list[Scalar]:
-    """Coefficients of the derivative."""
+    """Return the coefficients of the derivative."""
     return [k * c for k, c in enumerate(coefficients)][1:]
 
 
 def horner(coefficients: list[Scalar], x: Scalar | float) -> Scalar:
-    """Value of a polynomial at x."""
+    """Return the value of a polynomial at x."""
     return polynomial(x, *coefficients, derivatives=0)[0]
 
 
 def keeps_sign(coefficients: list[Scalar], sign: Scalar, length: Scalar) -> Scalar:
-    """Positive only if sign times the polynomial is certainly positive on (0, length].
+    """Return a number that is positive only if sign times the polynomial is certainly positive on (0, length].
 
-    As long as the leading coefficients are not negative, x^m times their sum is a lower bound of
-    their part; every later negative coefficient takes away at most its size times x^m.
+    As long as the leading coefficients are not negative, x^m times their sum is a lower bound of their part. Every
+    later negative coefficient lowers the sum by at most its size times x^m.
     """
     return _keeps_sign(length, sign, *coefficients)[0]
 
@@ -161,7 +165,7 @@ _keeps_sign = Compound("keeps_sign", _keeps_sign_written)
 
 
 def fall_bound(coefficients: list[Scalar], sign: Scalar, order: int, length: Scalar | float = 1.0) -> Scalar:
-    """How negative the derivative of this order of sign times the polynomial can be on [0, length] at most."""
+    """Bound minus the derivative of this order of sign times the polynomial, from above, on [0, length]."""
     if len(coefficients) <= order:
         return jnp.zeros_like(sign)
     return _fall_bound(length, sign, *coefficients[order:], order=order)[0]
@@ -177,17 +181,17 @@ _fall_bound = Compound("fall_bound", _fall_bound_written)
 
 
 def last_size(coefficients: list[Scalar]) -> Scalar:
-    """Size of the last coefficients.
+    """Return the size of the last coefficients.
 
-    Where the large ones are every second or third (a resonance, a steep ramp), the last two may both be small: those
-    before count, too, with a weight that does not matter for others.
+    Where every second or third is large (a resonance, a steep ramp), the last two may both be small. So those before
+    count, too, with a weight that does not matter for other series.
     """
     last = jnp.maximum(jnp.abs(coefficients[-1]), jnp.abs(coefficients[-2]))
     return jnp.maximum(last, 0.02 * jnp.maximum(jnp.abs(coefficients[-3]), jnp.abs(coefficients[-4])))
 
 
 def step_length(coefficients: list[Scalar], size: Scalar | float, cap: Scalar) -> Scalar:
-    """Step at which the last coefficients drop below `size`, at most `cap`."""
+    """Return the step at which the last coefficients drop below `size`, at most `cap`."""
     order, last = len(coefficients) - 1, last_size(coefficients)
     tiny = jnp.finfo(last.dtype).tiny
     ratio = size / jnp.maximum(last, tiny)
@@ -195,12 +199,12 @@ def step_length(coefficients: list[Scalar], size: Scalar | float, cap: Scalar) -
 
 
 def longest(order: int, dtype: Any) -> float:
-    """A step whose powers up to this order are finite: where coefficients have vanished nothing else bounds it."""
+    """Return a step whose powers up to this order are finite: the only bound where coefficients have vanished."""
     return float(jnp.finfo(dtype).max) ** (1 / (order + 2))
 
 
 def root_of(value: Scalar, degree: int) -> Scalar:
-    """The root of this degree (6 or more) of a positive number, to about one per cent.
+    """Return the root of this degree (6 or more) of a positive number, to about one per cent.
 
     The bits of a float, read as an integer, are nearly its logarithm: a power function would not vectorise.
     """
@@ -216,7 +220,7 @@ def root_of(value: Scalar, degree: int) -> Scalar:
 
 
 class Watch(NamedTuple):
-    """A quantity whose first sign change is wanted: sign (derivative of the polynomial - offset), positive at first."""
+    """A quantity whose first sign change is sought: sign (derivative of the polynomial - offset), positive at first."""
 
     derivative: int
     sign: Scalar
@@ -225,7 +229,7 @@ class Watch(NamedTuple):
 
 
 class Landing(NamedTuple):
-    """Where the march stopped, the polynomial's jet there, and which watched quantities reached zero."""
+    """The end of a march: the point, the polynomial's jet there, and which watched quantities reached zero."""
 
     x: Scalar
     jet: list[Scalar]
@@ -233,13 +237,13 @@ class Landing(NamedTuple):
 
 
 def _clear_length_written(value, slope, fall):
-    """Length on which value + slope x - fall x^2/2 stays positive: no zero can hide there."""
+    """Return the length on which value + slope x - fall x^2/2 stays positive: it contains no zero."""
     root = jnp.sqrt(jnp.maximum(slope * slope + 2 * fall * value, 0.0))
     rising = slope > 0
-    # The zero of the parabola without cancellation: of its two forms the one that adds.
+    # Take the form of the parabola's zero that adds, to avoid cancellation.
     sum_ = keep(where(rising, slope + root, slope - root), fall)
     above, below = where(rising, sum_, 2 * value), where(rising, fall, -sum_)
-    # Nothing pulls it down: clear for ever, unless it is at zero and does not rise.
+    # Without a fall there is no zero, unless the value is zero and does not rise.
     endless = where((value > 0) | rising, jnp.inf, 0.0)
     return [where(below > 0, above / where(below > 0, below, 1.0), endless)]
 
@@ -250,17 +254,19 @@ _clear_length = Compound("clear_length", _clear_length_written)
 def first_event(coefficients: list[Scalar], watches: list[Watch], start: Scalar, needed: Flag) -> Landing:
     """March from `start` to the first point of [0, 1] where a watched quantity changes sign.
 
-    Each stride is the largest on which a parabola below every watched quantity stays positive, so no
-    zero is stepped over, be it one of two in a narrow dip; near a simple zero the strides are Newton's.
-    When the strides do not come to an end (a zero that is nearly double), the march stops where it
-    is, with no hit: everything before that point is certain. Where not `needed` it does not start (lanes
-    march together under vmap, as long as the slowest). It has no derivatives.
+    Each stride is the largest on which a parabola below every watched quantity stays positive. So no zero is stepped
+    over, not even one of two in a narrow dip; near a simple zero the strides are Newton's. When the strides do not come
+    to an end (a zero that is nearly double), the march stops there, with no hit: everything before that point is
+    certain.
+
+    Where not `needed` the march does not start (lanes march together under vmap, as long as the slowest). The result
+    has no derivatives.
     """
     highest = max(w.derivative for w in watches) + 1
     eps = jnp.finfo(start.dtype).eps
 
     def clear(x, radius):
-        """For every quantity the length after x on which it has no zero."""
+        """Return, for every quantity, the length after x on which it has no zero."""
         values, end = jet(coefficients, x, highest), jnp.minimum(x + radius, 1.0)
         lengths = [
             _clear_length(
@@ -277,7 +283,7 @@ def first_event(coefficients: list[Scalar], watches: list[Watch], start: Scalar,
         stride = keep(jnp.clip(functools.reduce(jnp.minimum, clear(x, radius)), 0.0, radius), x)
         reached = jnp.minimum(x + stride, 1.0)
         going = (stride > 2 * eps * reached) & (reached < 1) & (count < 100)
-        # The lower parabola only has to hold as far as the next stride may go: near is tight.
+        # The parabola has to be a lower bound only as far as the next stride may go: a short radius is tight.
         return reached, jnp.minimum(4 * stride, 1.0), going, count + 1
 
     x, radius, _, _ = jax.lax.while_loop(
@@ -288,7 +294,7 @@ def first_event(coefficients: list[Scalar], watches: list[Watch], start: Scalar,
 
 
 def meet(x: Scalar, forcing: list[Scalar], level: Scalar) -> Scalar:
-    """x, where the series `forcing` meets `level`, as it is given; its derivatives are those of the root."""
+    """Return x, at which the series `forcing` meets `level`, with the derivatives of the root."""
     return given(_meeting, x, (forcing, level))
 
 

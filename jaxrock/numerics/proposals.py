@@ -1,19 +1,21 @@
-"""Samples of a distribution whose density is dear to compute: chains whose proposals do not depend on where they are.
+"""Independence sampler for a distribution whose density is expensive: proposals do not depend on the chains' states.
 
-So those of all chains and many steps are computed at once, each of them once, and a proposal leads from any maximum to
-any other. How often one is taken tells how near the proposals are to the distribution. They learn from all points that
-were computed before: kernels around some of these, drawn by their weights, each about as wide as its neighbours are
-apart (Cappe et al. 2004). A small share is spread evenly over the box, so that no place is out of reach; but chains
-that agree cannot tell of a summit so narrow that no proposal has met it.
+So the proposals of all chains and many steps are evaluated in one batch, each once, and a proposal leads from any
+maximum to any other. The acceptance rate tells how near the proposals are to the distribution.
 
-`independent_proposals` makes of it a sampler in the manner of BlackJAX, for any density over a box whose values at many
-places are cheaper together:
+The proposals are learned from all points evaluated before. They are kernels around some of these points, drawn by their
+weights, each about as wide as the distances of its neighbours (Cappe et al. 2004). A small share is uniform over the
+box, so that every place can be reached. But chains that agree cannot reveal a summit so narrow that no proposal has met
+it.
+
+`independent_proposals` wraps this as a sampler with BlackJAX's interface, for any density over a box that is cheaper to
+evaluate in batches:
 
     sampler = independent_proposals(log_density, low=np.zeros(2), high=np.ones(2))
     state = sampler.init(np.array([[0.3, 0.5]]), key)
     for number in range(20):
         state, info = sampler.step(jax.random.fold_in(key, number), state)
-    state.places[1:]
+        state.places[1:]
 """
 
 import math
@@ -24,24 +26,24 @@ import jax
 import numpy as np
 
 ROUNDS = 12  # of learning, at most
-_ENOUGH = 0.5  # independent points for each that is drawn, with which it has learned enough
-_RISE = 1.1  # of that from round to round, below which it learns no more
-_FREEDOM = 5.0  # degrees, of Student's t: tails that are heavier than those of most distributions
+_ENOUGH = 0.5  # independent points per drawn point at which learning ends
+_RISE = 1.1  # least ratio of that from round to round; below it learning ends
+_FREEDOM = 5.0  # degrees of freedom of Student's t, whose tails are heavier than those of most distributions
 _KERNELS = 400  # at most
-_NEIGHBOURS = 25  # kernels by whose distances one is as wide as it is; at least six for each dimension
-_WIDER = 0.03  # than that, of the width of all
+_NEIGHBOURS = 25  # kernels whose distances set the width of one; at least six for each dimension
+_WIDER = 0.03  # added width, as a share of the width of all
 _EVENLY = 0.05
-_AROUND, _FIRST_EVENLY = 0.05, 0.85  # widths of the first kernels, in boxes; the share that is even then
-_FEWEST = 50  # points that weights must leave; otherwise they are made more alike
-_TRIED = 256  # places of each kernel, to see how much of it is in the box
+_AROUND, _FIRST_EVENLY = 0.05, 0.85  # widths of the first kernels, as shares of the box; the uniform share then
+_FEWEST = 50  # least effective number of points; with fewer, weights are flattened
+_TRIED = 256  # draws from each kernel that estimate its share inside the box
 
 
 class Kernels(NamedTuple):
-    """A distribution in a box: a share of it even, the rest in kernels.
+    """A distribution in a box: a uniform share, and kernels.
 
-    - `centres`: (kernels, dimensions); `roots`: (kernels, dimensions, dimensions) their covariances are root root^T.
-    - `shares`: (kernels,) which, with the even one, are about 1 of what is in the box.
-    - `evenly`: the even share; `low`, `high`: (dimensions,) the box.
+    - `centres`: (kernels, dimensions); `roots`: (kernels, dimensions, dimensions), covariances are root root^T.
+    - `shares`: (kernels,); with the uniform one, the shares inside the box sum to about 1.
+    - `evenly`: the uniform share; `low`, `high`: (dimensions,) the box.
     """
 
     centres: np.ndarray
@@ -52,7 +54,7 @@ class Kernels(NamedTuple):
     high: np.ndarray
 
     def draw(self, random: np.random.Generator, count: int) -> np.ndarray:
-        """So many independent places, (count, dimensions); what falls out of the box is drawn again."""
+        """Draw `count` independent places, (count, dimensions); a place outside the box is drawn again."""
         size, accepted = self.low.size, np.empty((0, self.low.size))
         shares = np.append(self.shares, self.evenly) / (self.shares.sum() + self.evenly)
         while len(accepted) < count:
@@ -67,9 +69,11 @@ class Kernels(NamedTuple):
         return accepted[:count]
 
     def log_density(self, places: np.ndarray) -> np.ndarray:
-        """Logarithm of the density at places in the box, (n, dimensions), but for a constant that is near zero."""
+        """Return the logarithm of the density at places in the box, (n, dimensions), up to a constant that is near
+        zero.
+        """
         size = self.low.size
-        # By matrices' products and a sum of exponentials: six times as fast as `einsum` and `logaddexp.reduce`.
+        # Matrix products and a plain sum of exponentials are six times as fast as `einsum` and `logaddexp.reduce`.
         away = np.matmul(places - self.centres[:, None], np.linalg.inv(self.roots).transpose(0, 2, 1))
         log_kernels = -(_FREEDOM + size) / 2 * np.log1p(np.einsum("kni,kni->kn", away, away) / _FREEDOM)
         heights = np.log(self.shares) - np.linalg.slogdet(self.roots)[1] - size / 2 * math.log(_FREEDOM * math.pi)
@@ -81,16 +85,17 @@ class Kernels(NamedTuple):
 
 
 def _student(random: np.random.Generator, count: int, size: int) -> np.ndarray:
-    """Draws of Student's t in so many dimensions, (count, size)."""
+    """Draw from Student's t in `size` dimensions, (count, size)."""
     return random.normal(size=(count, size)) / np.sqrt(random.chisquare(_FREEDOM, count) / _FREEDOM)[:, None]
 
 
 def _kernels(
     centres: np.ndarray, roots: np.ndarray, weights: np.ndarray, evenly: float, low: np.ndarray, high: np.ndarray
 ) -> Kernels:
-    """Kernels with such weights of what is drawn in the box: those at its ends, where much is drawn again, have more.
+    """Make kernels with these weights inside the box: kernels at its ends, which often draw again, have larger shares.
 
-    How much is counted, not known. That changes the proposals a little, and not how well their density is known.
+    The share inside is estimated by counting. An error changes the proposals a little, but not the accuracy of their
+    density.
     """
     away = _student(np.random.default_rng(0), _TRIED, low.size)
     tried = centres[:, None] + np.einsum("kij,nj->kni", roots, away)
@@ -100,21 +105,24 @@ def _kernels(
 
 
 def around(centres: np.ndarray, extent: float, evenly: float, low: np.ndarray, high: np.ndarray) -> Kernels:
-    """Kernels of an extent, in shares of the box, and an even share."""
+    """Make kernels of equal widths, in shares of the box, and a uniform share."""
     roots = np.tile(extent * np.diag(high - low), (len(centres), 1, 1))
     return _kernels(centres, roots, np.ones(len(centres)), evenly, low, high)
 
 
 class Drawn(NamedTuple):
-    """Points of several rounds: places (n, dimensions), logarithms of the wanted density there (n,), and the
-    distributions that they were drawn from, with their numbers."""
+    """Points of several rounds.
+
+    - `places`: (n, dimensions); `log_density`: (n,) logarithms of the wanted density there.
+    - `rounds`: the distributions from which they were drawn, with their numbers of points.
+    """
 
     places: np.ndarray
     log_density: np.ndarray
     rounds: tuple[tuple[int, Kernels], ...]
 
     def and_more(self, places: np.ndarray, log_density: np.ndarray, kernels: Kernels) -> "Drawn":
-        """These and another round."""
+        """Append the points of another round."""
         rounds, count = self.rounds, len(places)
         if rounds and rounds[-1][1] is kernels:
             rounds, count = rounds[:-1], count + rounds[-1][0]
@@ -123,18 +131,18 @@ class Drawn(NamedTuple):
 
     @property
     def log_weights(self) -> np.ndarray:
-        """Logarithms of the weights with which all points together stand for the wanted distribution, (n,)."""
+        """Logarithms of the importance weights of all points together for the wanted distribution, (n,)."""
         parts = [math.log(count) + kernels.log_density(self.places) for count, kernels in self.rounds]
         return self.log_density - np.logaddexp.reduce(parts, axis=0)
 
     def learned(self, random: np.random.Generator) -> tuple[Kernels, bool]:
-        """Kernels around some of the points, and whether their weights were taken as they are."""
+        """Return kernels around some of the points, and whether their weights were used unflattened."""
         shares, plain = _shares(self.log_weights)
         drawn = random.choice(len(shares), size=_KERNELS, p=shares)
         which, weights = np.unique(drawn, return_counts=True)
         last, centres = self.rounds[-1][1], self.places[which]
         size = last.low.size
-        # Points that are all the same, or in a plane, have a width as well.
+        # Added so that points that coincide, or lie in a plane, have a width as well.
         covariance = np.cov(self.places[drawn].T).reshape(size, size) + 1e-10 * np.diag((last.high - last.low) ** 2)
         root = np.linalg.cholesky(covariance)
         white = np.linalg.solve(root, centres.T).T
@@ -148,7 +156,7 @@ class Drawn(NamedTuple):
 
 
 def _shares(log_weights: np.ndarray) -> tuple[np.ndarray, bool]:
-    """Weights that add up to one; where only a few points have all of it, more alike, and whether they are not."""
+    """Normalise weights, flattened where a few points have nearly all; return whether they are not flattened."""
     relative = log_weights - log_weights.max()
     for power in np.linspace(1.0, 0.02, 50):
         shares = np.exp(power * relative)
@@ -159,7 +167,7 @@ def _shares(log_weights: np.ndarray) -> tuple[np.ndarray, bool]:
 
 
 def _efficiency(log_weights: np.ndarray) -> float:
-    """How many independent points of the wanted distribution one of these is worth, by their weights (n,)."""
+    """Return the effective number of independent points per point, by their weights (n,)."""
     weights = np.exp(log_weights - log_weights.max())
     return float(weights.sum() ** 2 / np.sum(weights**2) / weights.size)
 
@@ -171,8 +179,10 @@ def learn(
     random: np.random.Generator,
     progress: Callable[[], None] = lambda: None,
 ) -> Drawn:
-    """Points of rounds of `count` proposals, the first from `kernels` and their centres, each of the next learned from
-    all before, until they are about as good as they get; `density`: logarithms (n,) at places (n, dimensions).
+    """Draw rounds of `count` proposals, until their efficiency stops improving.
+
+    The first round draws from `kernels` and their centres, each later one from kernels learned from all points before.
+    `density`: logarithms (n,) at places (n, dimensions).
 
     **Raises:** ValueError if all of the first have a density of zero.
     """
@@ -187,7 +197,7 @@ def learn(
         drawn = drawn.and_more(places, values, kernels)
         progress()
         efficiency = _efficiency(values - kernels.log_density(places)) if np.isfinite(values).any() else 0.0
-        # While few points have all of the weight, it says nothing yet.
+        # While few points have all of the weight, the efficiency says nothing yet.
         if efficiency > _ENOUGH or (plain and efficiency < _RISE * best):
             break
         best = max(best, efficiency)
@@ -196,8 +206,12 @@ def learn(
 
 
 class Chains(NamedTuple):
-    """Chains so far, with where they began: places (steps + 1, chains, dimensions), log-densities (steps + 1, chains),
-    logarithms of the weights where they are (chains,), what is proposed to them, and all points up to now."""
+    """Chains so far, with their first places.
+
+    - `places`: (steps + 1, chains, dimensions); `log_density`: (steps + 1, chains).
+    - `held`: (chains,) logarithms of the weights at the current places.
+    - `kernels`: the distribution of proposals; `drawn`: all points up to now.
+    """
 
     places: np.ndarray
     log_density: np.ndarray
@@ -207,12 +221,15 @@ class Chains(NamedTuple):
 
     @property
     def steps(self) -> int:
-        """How many there were."""
+        """Number of steps."""
         return len(self.places) - 1
 
     def follow(self, density: Callable[[np.ndarray], np.ndarray], steps: int, random: np.random.Generator) -> "Chains":
-        """The chains some steps later: each goes to what is proposed with a probability of the ratio of the weights
-        there and where it is (Hastings 1970)."""
+        """Advance the chains by some steps.
+
+        A chain accepts a proposal with a probability of the ratio of the weights there and at its place (Hastings
+        1970).
+        """
         count = self.held.size
         proposed = self.kernels.draw(random, steps * count)
         values = density(proposed)
@@ -231,8 +248,10 @@ class Chains(NamedTuple):
 
 
 def begin(drawn: Drawn, count: int, random: np.random.Generator) -> Chains:
-    """So many chains with proposals that learned from all points, which begin at some of these: by their weights, so
-    that they are about where they will be."""
+    """Start `count` chains with proposals learned from all points.
+
+    The chains start at some of the points, drawn by their weights, so that they begin near equilibrium.
+    """
     kernels, _ = drawn.learned(random)
     weights = np.exp(drawn.log_weights - drawn.log_weights.max())
     at = random.choice(weights.size, size=count, p=weights / weights.sum())
@@ -241,8 +260,11 @@ def begin(drawn: Drawn, count: int, random: np.random.Generator) -> Chains:
 
 
 class Taken(NamedTuple):
-    """What a round of steps has come to: places (steps, chains, dimensions), log-densities there (steps, chains), and
-    the share of proposals that were taken."""
+    """The result of a round of steps.
+
+    - `places`: (steps, chains, dimensions); `log_density`: (steps, chains).
+    - `acceptance_rate`: share of accepted proposals.
+    """
 
     places: np.ndarray
     log_density: np.ndarray
@@ -250,13 +272,13 @@ class Taken(NamedTuple):
 
 
 class Sampler(NamedTuple):
-    """A sampler in the manner of BlackJAX; its states are `Chains`, and nothing else remembers anything.
+    """A sampler with BlackJAX's interface; its states are `Chains`, and it has no other memory.
 
     - `init(places, key)`: chains that have learned, from first places (n, dimensions) where the density is large.
-    - `step(key, state, steps)`: the chains a round later (or so many steps), and what was `Taken` in it.
-    - `anew(key, state)`: chains that begin anew, with proposals that learned from all that was met since.
+    - `step(key, state, steps)`: the chains after a round (or so many steps), and the `Taken` steps.
+    - `anew(key, state)`: chains that begin anew, with proposals learned from all points evaluated since.
 
-    A key is one of JAX, or a generator of random numbers of NumPy.
+    A key is one of JAX, or a NumPy random generator.
     """
 
     init: Callable[..., Chains]
@@ -273,13 +295,13 @@ def independent_proposals(
     points: int = 512,
     progress: Callable[[], None] = lambda: None,
 ) -> Sampler:
-    """A sampler for a density that is dear, and known at many places at once.
+    """Make a sampler for a density that is expensive, and evaluated at many places at once.
 
     **Arguments:**
 
-    - `log_density`: logarithms (n,) of the density at places (n, dimensions), but for a constant.
-    - `low`, `high`: (dimensions,) the box outside of which there is none of it.
-    - `chains`: how many; `points`: how many places are computed together, a multiple of them.
+    - `log_density`: logarithms (n,) of the density at places (n, dimensions), up to a constant.
+    - `low`, `high`: (dimensions,) the box, outside of which the density is zero.
+    - `chains`: their number; `points`: number of places in one batch, a multiple of it.
     - `progress`: called after every round of learning.
 
     **Returns:** a `Sampler`.

@@ -17,10 +17,10 @@ _MOST_STEPS = 100
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
 def bracketed_root(function: Callable, lower: Real, upper: Real, *parameters: Real) -> Real:
-    """Where `function(x, *parameters)`, elementwise, changes its sign between `lower` and `upper`.
+    """Return the point between `lower` and `upper` where `function(x, *parameters)`, elementwise, changes its sign.
 
-    Where it does not, the end where it is smaller in size is returned. Derivatives of every order with respect to the
-    parameters (none to the bracket) come from the implicit function, at such an end, too, where they mean nothing;
+    Without a change of sign, it is the end where the function is smaller in size. Derivatives of every order by the
+    parameters (none by the bracket) come from the implicit function theorem; at such an end they mean nothing.
     `function` must not close over traced values.
     """
     shape = jnp.broadcast_shapes(*(jnp.shape(value) for value in (lower, upper, *parameters)))
@@ -31,19 +31,19 @@ def bracketed_root(function: Callable, lower: Real, upper: Real, *parameters: Re
 def _bracketed_root_jvp(function, primals, tangents):
     (lower, upper, *parameters), (_, _, *changes) = primals, tangents
     root = bracketed_root(function, lower, upper, *parameters)
-    _, change_by = jax.linearize(function, root, *parameters)  # once: it may hold a search, too
+    _, change_by = jax.linearize(function, root, *parameters)  # linearised once: the function may hold a search, too
     slope = change_by(jnp.ones_like(root), *map(jnp.zeros_like, parameters))
     change = change_by(jnp.zeros_like(root), *changes)
-    flat = slope == 0  # a double root, or an end that is none
+    flat = slope == 0  # a double root, or an end of the bracket without a root
     return root, jnp.where(flat, 0.0, -change / jnp.where(flat, 1.0, slope))
 
 
 def carried(x: Real, step: Callable, times: int = 2) -> Real:
-    """`x`, a root that was found without derivatives, with those of the implicit function.
+    """Return `x`, a root found without derivatives, with those of the implicit function.
 
-    `step(x)`, which may hold what is traced (otherwise see `implicit`): how far the root is by Newton's method, with
-    derivatives. The root itself does not move; each time doubles the order to which derivatives are exact: the first
-    after one, the second and third after two.
+    `step(x)` is Newton's distance to the root, with derivatives. It may close over traced values; if it does not, use
+    `implicit`. The root itself does not move. Each repetition doubles the order to which derivatives are exact: the
+    first after one, the second and third after two.
     """
     for _ in range(times):
         left = step(x)
@@ -52,21 +52,21 @@ def carried(x: Real, step: Callable, times: int = 2) -> Real:
 
 
 def implicit(step: Callable, x: Tree, by: Any) -> Tree:
-    """`x`, a root that was found without derivatives, with those of every order of the implicit function.
+    """Return `x`, a root found without derivatives, with those of every order of the implicit function.
 
-    `step(by, x)`, a function of a module: how far the root is by Newton's method. Without derivatives it is computed by
-    nobody.
+    `step(by, x)`, a function of a module, is Newton's distance to the root. It is computed only for derivatives.
     """
     return given(_by_newton, x, by, step)
 
 
 def _by_newton(step: Callable, x: Tree, by: Any, changes: Any) -> Tree:
-    # At a root the step's slope by x is one.
+    # At a root, the derivative of the step by x is one.
     return jax.tree.map(jnp.negative, along(lambda by: step(by, x), by, changes))
 
 
 def search_root(function: Callable, a: Real, b: Real) -> Real:
-    """The root of `function(x)`, elementwise, between arrays `a` and `b` of one shape, to rounding; no derivatives.
+    """Return the root of `function(x)`, elementwise, between arrays `a` and `b` of one shape, to rounding; no
+    derivatives.
 
     **Source:** Chandrupatla (1997), inverse quadratic interpolation where it is safe, else bisection.
     """
@@ -78,7 +78,7 @@ def search_root(function: Callable, a: Real, b: Real) -> Real:
 
     def step(carry):
         a, b, c, fa, fb, fc, share, count = carry
-        # The ends first, in the same loop: a function is large, and here it is compiled once.
+        # The loop evaluates the ends first: a function is large, and so it is compiled once.
         first, begins = count == 0, count < 2
         x = jnp.where(begins, jnp.where(first, *ends), a + share * (b - a))
         fx = function(x)
@@ -104,7 +104,7 @@ def _open(a, b, fa, fb, tight):
 
 
 def _next_share(a, b, c, fa, fb, fc, tight):
-    """Where between a and b to look next."""
+    """Return the next point between a and b, as a share of the way."""
     xi, phi = (a - b) / (c - b), (fa - fb) / (fc - fb)
     safe = (phi**2 < xi) & ((1 - phi) ** 2 < 1 - xi)
     guess = fa / (fb - fa) * fc / (fb - fc) + (c - a) / (b - a) * fa / (fc - fa) * fb / (fc - fb)

@@ -1,4 +1,4 @@
-"""AT2, the format of the database of PEER: a header with NPTS and DT, then samples."""
+"""AT2, the format of the PEER database: a header with NPTS and DT, then samples."""
 
 import re
 
@@ -21,16 +21,16 @@ from jaxrock.motions.record import Origin
 _UNIT = re.compile(r"\bUNITS\s*(?:OF|IN|[:=])?\s*\(?\s*([^\s,;()]+)(.*)", re.IGNORECASE)
 _UNIT_ALONE = re.compile(r"(?:\bIN\b|[(\[])\s*[(\[]?\s*([^\s,;()\[\]]+)(.*)", re.IGNORECASE)
 _TIMES = re.compile(r"\s*[)\]]?\s*(?:[*×/^]|X\s*[-+.\d]|TIMES\b|DIVIDED\b)", re.IGNORECASE)  # a factor beside a unit
-_VALUED = re.compile(r"\s*[)\]]?\s*[:=]\s*[-+.]?\d")  # "PGA (CM/S2) = 805" is no unit of the samples
+_VALUED = re.compile(r"\s*[)\]]?\s*[:=]\s*[-+.]?\d")  # "PGA (CM/S2) = 805" states no unit of the samples
 _OTHER_KIND = re.compile(r"^\s*(VELOCITY|DISPLACEMENT)\s+(?:TIME|HISTORY|SERIES|IN\s+UNITS)\b", re.IGNORECASE)
 _COUNT = re.compile(r"(?<![A-Z])NPTS\s*=?\s*(\d+)", re.IGNORECASE)
 _STEP = re.compile(rf"(?<![A-Z])DT\s*=?\s*({NUMBER})\s*([A-Zµμ]*)", re.IGNORECASE)
 _RATE = re.compile(rf"(?<![A-Z])DT\s*=?\s*{NUMBER}\s*(K?HZ|SPS|SAMPLES|POINTS|PTS|1/S)", re.IGNORECASE)
 _BEFORE = re.compile(rf"^\s*(\d+)[\s,]+({NUMBER})[\s,]+NPTS[\s,]+DT\b", re.IGNORECASE)
 
-_MANY = 50  # lines that tell how numbers are printed
+_MANY = 50  # lines from which the printed digits are read
 
-# Printed numbers may touch, but only a sign tells where the next begins: 1.234562.34567 is refused.
+# Printed numbers may touch, but only a sign marks the next: 1.234562.34567 is refused.
 _NUMBERS = re.compile(rf"\s*{NUMBER}(?:(?:\s+|(?=[-+])){NUMBER})*\s*")
 
 
@@ -68,7 +68,9 @@ class AT2(AbstractFormat):
 
 
 def _check_kind(name: str, header: list[str]) -> None:
-    """Refuse what is said to be no acceleration, and a sampling rate in place of a time step."""
+    """Refuse a file whose header states another quantity than acceleration, or a sampling rate in place of a time
+    step.
+    """
     for number, line in enumerate(header, 1):
         kind, rate = _OTHER_KIND.search(line), _RATE.search(line)
         if kind:
@@ -78,7 +80,7 @@ def _check_kind(name: str, header: list[str]) -> None:
 
 
 def _unit_of(name: str, header: list[str]) -> tuple[int | None, str]:
-    """The line that states the unit, and the unit: what says UNITS goes before what stands in brackets."""
+    """Return the line that states the unit, and the unit; a line with UNITS goes before one with brackets."""
     stated = [(number, unit) for number, line in enumerate(header) if (unit := _unit_in(line))]
     found = [each for each in stated if _UNIT.search(header[each[0]])] or stated
     for number, unit in found[1:]:
@@ -89,7 +91,9 @@ def _unit_of(name: str, header: list[str]) -> tuple[int | None, str]:
 
 
 def _unit_in(line: str) -> str:
-    """The unit that a line of the header states, with a factor beside it, which makes it another; or nothing."""
+    """Return the unit that a header line states, with a factor beside it, which makes it another unit; or an empty
+    text.
+    """
     found = _UNIT.search(line)
     for alone in () if found else _UNIT_ALONE.finditer(line):
         sure = is_any_unit(alone[1]) and alone[1].lower() not in SHORT and alone[1].lower() not in SECONDS
@@ -104,14 +108,14 @@ def _unit_in(line: str) -> str:
 
 
 def _origin(title: str) -> Origin:
-    """Event, station and component: the first, the middle and the last of what stands between commas."""
+    """Return event, station and component: the first, the middle and the last part between commas."""
     event, *station, component = [part.strip() for part in title.split(",")] if title.count(",") > 1 else (title, "")
     station = [part for part in station if not re.fullmatch(r"[\d/:. -]+", part)]
     return Origin(event, ", ".join(station), (component.split() or [""])[0])
 
 
 def _counts(line: str) -> tuple[int, float] | None:
-    """The number of samples and the time step in a header line [s]."""
+    """Return the number of samples and the time step of a header line [s]."""
     count, steps = _COUNT.search(line), _steps(line)
     if count and steps:
         return int(count[1]), steps[0]
@@ -120,19 +124,19 @@ def _counts(line: str) -> tuple[int, float] | None:
 
 
 def _steps(line: str) -> list[float]:
-    """All time steps that a line states [s]."""
+    """Return all time steps that a line states [s]."""
     return [to_float(number) * SECONDS.get(unit.lower(), 1.0) for number, unit in _STEP.findall(line)]
 
 
 def _printed(lines: list[str]) -> list[str]:
-    """Numbers as they are printed: many of the first, and the last."""
+    """Return numbers as they are printed: many of the first, and the last."""
     samples = [line for line in lines if line.strip() and _NUMBERS.fullmatch(line)]
     samples = samples[:_MANY] + samples[max(_MANY, len(samples) - 2) :]
     return [text for line in samples for text in re.findall(NUMBER, line)]
 
 
 def _numbers(line: str) -> list[float] | None:
-    """The numbers in a line, or None if it holds anything else; they may touch before a sign."""
+    """Return the numbers in a line, or None if it holds anything else; they may touch before a sign."""
     if not _NUMBERS.fullmatch(line):
         return None
     return [to_float(text) for text in re.findall(NUMBER, line)]

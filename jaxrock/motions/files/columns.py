@@ -19,11 +19,11 @@ _FIELD = re.compile(NUMBER + r"|[-+]?(?:nan|inf|infinity)", re.IGNORECASE)
 
 
 class Columns(AbstractFormat):
-    """Columns of text: what a file is taken for that is of no format with a header.
+    """Columns of text: the format of a file without a known header.
 
     **Arguments:**
 
-    - `with_headers`: those formats, which the message names for a file that holds no columns.
+    - `with_headers`: the formats with headers, which the message names for a file that holds no columns.
     """
 
     name = "csv"
@@ -56,7 +56,7 @@ class Columns(AbstractFormat):
             allowed = "be 'g', 'm/s2' or 'cm/s2'"
             raise ValueError(f"Argument `unit` must {allowed} for text file `{name}`, which states none, but is None.")
         times = table[:, 0]
-        # Beside `column` and `dt`, column 0 may hold accelerations too; only times never fall.
+        # With `column` and `dt` given, column 0 may hold accelerations too; only times never fall.
         rising = times[-1] > times[0] and (np.diff(times) >= 0).all()
         if chosen > 0 and (column is None or dt is None or rising):
             dt = _step_of(name, titles, table[:, 0], numbers, printed, dt)
@@ -67,7 +67,7 @@ class Columns(AbstractFormat):
     def components(self, name, lines):
         table, numbers, _ = _table(name, lines)
         if not numbers:
-            return super().components(name, lines)  # which `read` refuses
+            return super().components(name, lines)  # `read` raises the error
         width = table.shape[1]
         titles = _titles(name, lines, numbers[0], width)
         first = int(titles.is_time(0) or titles.counts(0) or _are_times(table[:, 0]))
@@ -77,11 +77,13 @@ class Columns(AbstractFormat):
         return tuple(range(first, width))
 
 
-_LONG_STEP = 0.2  # [s]; accelerations are sampled more often, and a step of 5 ms that is read as one of s is 5
+_LONG_STEP = 0.2  # [s]; accelerations are sampled more often: a step of 5 ms read as seconds is 5
 
 
 def _step_of(name: str, titles: Titles, times: np.ndarray, numbers, printed, dt: float | None) -> float | None:
-    """The time step of the first column, which agrees with `dt` if that is given [s]; `dt` where it counts samples."""
+    """Return the time step of the first column [s], after a comparison with `dt`; `dt` itself if the column counts
+    samples.
+    """
     seconds = titles.seconds(name, times)
     if seconds is None:
         return dt
@@ -104,7 +106,7 @@ def _are_times(values: np.ndarray, dt: float | None = None) -> bool:
 
 
 def _titles(name: str, lines: list[str], first: int, width: int) -> Titles:
-    """What is written above line number `first`, of numbers."""
+    """Return the titles in the lines above line number `first`, the first line of numbers."""
     return titles_of(name, lines[: first - 1], width, lines[first - 1].rstrip().endswith((",", ";")))
 
 
@@ -122,15 +124,15 @@ def _check_commas(name: str, lines: list[str], table: np.ndarray, numbers: Seque
 
 
 def _fields(line: str) -> list[str]:
-    """The fields of a line of columns."""
-    # Beside semicolons, commas are decimal: such numbers are refused, not parted.
+    """Return the fields of a line of columns."""
+    # With semicolons as separators, commas are decimal: such numbers are refused, not split.
     separator = next((mark for mark in ";," if mark in line), None)
     fields = [field.strip() for field in line.split(separator)]
     return fields[:-1] if not fields[-1] else fields
 
 
 def _table(name: str, lines: list[str]) -> tuple[np.ndarray, Sequence[int], list[str]]:
-    """The numbers in columns of text, the line number of each row, and some first fields as written."""
+    """Return the numbers in columns of text, the line number of each row, and some first fields as written."""
     found = _table_at_once(name, lines)
     if found is not None:
         return found
@@ -161,7 +163,7 @@ def _table(name: str, lines: list[str]) -> tuple[np.ndarray, Sequence[int], list
 
 
 def _check_header(name: str, number: int, line: str) -> None:
-    """Refuse a line of a header that looks like numbers."""
+    """Refuse a header line that looks like numbers."""
     if _DECIMAL_COMMAS.fullmatch(line):
         raise file_error(name, f"line {number} holds decimal commas, which must be points: {line[:60]!r}.")
     if LIKE_DATA.match(line):
@@ -170,11 +172,11 @@ def _check_header(name: str, number: int, line: str) -> None:
 
 
 _MARKS = re.compile(r"[^-+.0-9EeDd \t\n,]")
-_SOME = 200  # rows that tell how numbers are printed
+_SOME = 200  # rows from which the printed digits are read
 
 
 def _table_at_once(name: str, lines: list[str]) -> tuple[np.ndarray, range, list[str]] | None:
-    """The same of many rows of nothing else; None where lines have to be looked at one by one."""
+    """Return the results of `_table` for many rows of numbers only; None where lines have to be parsed one by one."""
     if len(lines) < _SOME:
         return None
     end = len(lines) - next((k for k, line in enumerate(reversed(lines)) if line.strip()), 0)
@@ -197,20 +199,20 @@ def _table_at_once(name: str, lines: list[str]) -> tuple[np.ndarray, range, list
 
 
 def _rounding(times: np.ndarray, printed: list[str]) -> float:
-    """By how much times may be off through rounding: one in the last digit, and single precision [s]."""
+    """Bound the rounding error of times: one unit in the last printed digit, and single precision [s]."""
     digits = max(len(re.sub(r"[ED].*|[-+.]", "", text.upper()).lstrip("0")) for text in printed)
     largest = np.abs(times).max()
     return 10.0 ** (np.floor(np.log10(largest)) + 1 - digits) + 1e-7 * largest
 
 
 def _step(name: str, times: np.ndarray, numbers: Sequence[int], printed: list[str]) -> float:
-    """The time step of equally spaced times [s]."""
+    """Return the time step of equally spaced times [s]."""
     if times.size < 2:
         raise file_error(name, "has one row only, so its times give no time step.")
     step = (times[-1] - times[0]) / (times.size - 1)
     if not step > 0:
         raise file_error(name, "the times in column 0 do not increase.")
-    # Where rounding is half a step, to allow for it would hide a missing row.
+    # A tolerance of half a step would hide a missing row, so there the tolerance is zero.
     rounding = _rounding(times, printed)
     rounding = rounding if rounding < 0.45 * step else 0.0
     slack = 1e-3 * step

@@ -40,7 +40,7 @@ class COSMOS(AbstractFormat):
     suffixes = (".v1c", ".v2c")
 
     def recognises(self, lines):
-        if is_spectra(lines):  # to say what it is
+        if is_spectra(lines):  # recognised, so that `read` can say what it is
             return True
         return any(_FIRST.match(line) for line in lines[:3]) and any(map(_DATA.match, lines[:400]))
 
@@ -60,7 +60,7 @@ class COSMOS(AbstractFormat):
         unit = agreed_unit(name, at + 1, unit, written)
         reals = _reals(name, lines, start)
         step = reals[_STEP] / 1000
-        # The line says it again, in whole seconds.
+        # The line repeats the duration, in whole seconds.
         if abs(int(count) * step - float(seconds)) > 1 + 0.01 * float(seconds):
             found = f"{count} samples in {seconds} s, but the header a time step of {step:g} s"
             raise file_error(name, f"line {at + 1} states {found}.")
@@ -76,7 +76,7 @@ class COSMOS(AbstractFormat):
 
 
 def _records(lines: list[str]) -> list[tuple[int, int, int]]:
-    """Where each record of accelerations begins, announces its samples and ends; where there are none, of anything."""
+    """Return the begin, data line and end of each record of accelerations, or of all records where there are none."""
     starts = [number for number, line in enumerate(lines) if _FIRST.match(line)]
     found = {number: said[2] for number, line in enumerate(lines) if (said := _DATA.match(line))}
     chosen = [number for number, what in found.items() if _ACCELERATION.match(what)] or list(found)
@@ -86,7 +86,7 @@ def _records(lines: list[str]) -> list[tuple[int, int, int]]:
 
 
 def _reals(name: str, lines: list[str], start: int) -> list[float]:
-    """The real header of the record that begins at a line."""
+    """Return the real header of the record that begins at a line."""
     numbered = enumerate(lines[start:], start)
     at, found = next(((n, found) for n, line in numbered if (found := _REALS.match(line))), (0, None))
     if found is None:
@@ -108,7 +108,7 @@ def _reals(name: str, lines: list[str], start: int) -> list[float]:
 
 
 def _origin(lines: list[str]) -> Origin:
-    """What the lines of text say: they have fixed places."""
+    """Return the origin from the text header, whose entries have fixed places."""
 
     def after(pattern: str) -> str:
         found = next((m for line in lines for m in [re.search(pattern, line, re.IGNORECASE)] if m), None)

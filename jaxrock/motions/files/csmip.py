@@ -1,6 +1,6 @@
 """V2, the format of CSMIP (also of USC) for corrected acceleration: channels of columns of fixed width.
 
-Spectra (V3) are refused by what they are: see `spectra`; uncorrected accelerograms (V1) are read by `csmip_v1`.
+Spectra (V3) are recognised and refused: see `spectra`. Uncorrected accelerograms (V1) are read by `csmip_v1`.
 """
 
 import re
@@ -63,7 +63,7 @@ class CSMIP(AbstractFormat):
 
 
 def chosen_channel(name: str, kind: str, column: int | None, count: int) -> int:
-    """Which channel of a file of so many is asked for: the first, if none is."""
+    """Return the channel that is asked for, in a file with `count` channels; None asks for the first."""
     channel = 0 if column is None else column
     if channel >= count:
         allowed = f"be 0 to {count - 1}, a channel of {kind} file `{name}`"
@@ -72,7 +72,7 @@ def chosen_channel(name: str, kind: str, column: int | None, count: int) -> int:
 
 
 def check_last_columns(name: str, lines: list[str], start: int, width: int) -> None:
-    """The last line of a channel, at which a file may end, is whole."""
+    """Check that the last line of a channel, at which a file may end, is whole."""
     rows = [
         row for row, line in enumerate(lines[start:], start) if line.strip() and fixed_numbers(line, width) is not None
     ]
@@ -85,21 +85,21 @@ _PEAK = re.compile(rf"\s*PEAK\s+ACCELERATION\s*=\s*({NUMBER})\s*CM/SEC/SEC", re.
 
 
 def _check_peak(name: str, lines: list[str], start: int, at: int, samples: np.ndarray) -> None:
-    """The largest sample is the peak that the header of a channel states, if it does."""
+    """Check that the largest sample is the peak that the header of a channel states, if it states one."""
     for row in range(start, at):
         found = _PEAK.match(lines[row])
         if found:
             check_peak(name, row + 1, found[1], samples)
 
 
-# "CHAN  2: 360 DEG" of CSMIP, "COMP N08W" of USC.
+# CSMIP writes "CHAN  2: 360 DEG", USC "COMP N08W".
 _BEFORE_COMPONENT = re.compile(r"^(?:CHAN\s*\w*\s*:|COMP(?:ONENT)?\b[.:=]?)\s*", re.IGNORECASE)
 
 
 def told(lines: list[str], first: str, places: tuple[int, int, int]) -> tuple[str, Origin]:
-    """Event, station and channel in the lines before a channel's samples: in a title, and as what they are.
+    """Return event, station and channel in the lines before a channel's samples: as one title, and as an `Origin`.
 
-    `first`: how the text header of a channel begins; `places` of the three in it, counted in lines.
+    `first`: pattern of the first line of a channel's text header; `places` of the three in it, counted in lines.
     """
     starts = [row for row, line in enumerate(lines) if re.match(first, line, re.IGNORECASE)]
     header = lines[starts[-1] :] if starts else []

@@ -1,4 +1,4 @@
-"""V1, the format of CSMIP for uncorrected accelerograms: columns of samples, or of times and samples from a film."""
+"""V1, the CSMIP format for uncorrected accelerograms: columns of samples, or of times and samples from a film."""
 
 import re
 from typing import NamedTuple
@@ -25,7 +25,7 @@ _SAMPLES = re.compile(
     r"FORMAT:\s*\(\s*\d*[FE](\d+)\.\d+\s*\)",
     re.IGNORECASE,
 )
-# Of times and samples there is no such line: the text header says their number and unit.
+# Times and samples have no such line: the text header states their number and unit.
 _COUNT = re.compile(r"NO\.\s*OF POINTS\s*=\s*(\d+)", re.IGNORECASE)
 _UNIT = re.compile(r"UNITS\s+(?:OF UNCOR\w*\s+(?:ACCEL\w*|DATA)\s+)?ARE SEC\w*\s+AND\s+([^\s.,;]+)", re.IGNORECASE)
 _PEAK = re.compile(rf"\bMAX\s*=\s*({NUMBER})\s*(\S+?)\s*,", re.IGNORECASE)
@@ -64,7 +64,7 @@ class CSMIPUncorrected(AbstractFormat):
 
 
 class _Block(NamedTuple):
-    """Samples in `unit`, which `line` states; their time step, or their times [s]; where and how they are printed."""
+    """Samples in `unit`, which `line` states; their time step, or their times [s]; their first line and field width."""
 
     samples: np.ndarray
     unit: str
@@ -76,9 +76,9 @@ class _Block(NamedTuple):
 
 
 def _samples(name: str, lines: list[str], at: int) -> _Block:
-    """What is announced as samples alone."""
+    """Return a block that is announced as samples alone."""
     announced = _SAMPLES.match(lines[at])
-    assert announced is not None  # that is why this is called
+    assert announced is not None  # the caller has matched the line
     count, rate, unit, width = announced.groups()
     if not to_float(rate) > 0:
         raise file_error(name, f"line {at + 1} states {rate} samples a second.")
@@ -87,7 +87,7 @@ def _samples(name: str, lines: list[str], at: int) -> _Block:
 
 
 def _pairs(name: str, lines: list[str], at: int) -> _Block:
-    """Times and samples, after three headers."""
+    """Return times and samples, which follow three headers."""
     header, start = lines[at : at + _TEXT], at + _TEXT + _WHOLE + _REAL
     found = [next(((at + row + 1, m[1]) for row, line in enumerate(header) if (m := pattern.search(line))), None)
              for pattern in (_COUNT, _UNIT)]  # fmt: skip
@@ -103,7 +103,7 @@ def _pairs(name: str, lines: list[str], at: int) -> _Block:
 
 
 def _even(name: str, dt: float | None, times: np.ndarray, samples: np.ndarray) -> tuple[float, np.ndarray]:
-    """The time step [s] and samples of pairs: those that are there, or on the straight lines between them."""
+    """Return the time step [s] and equally spaced samples: the given ones, or points on the lines between them."""
     if times.size < 2 or not (np.diff(times) > 0).all():
         raise file_error(name, "the times of its samples do not increase.")
     step = (times[-1] - times[0]) / (times.size - 1)
@@ -118,7 +118,7 @@ def _even(name: str, dt: float | None, times: np.ndarray, samples: np.ndarray) -
 
 
 def _check_peak(name: str, lines: list[str], at: int, samples: np.ndarray, unit: str) -> None:
-    """The largest sample is what the text header states, to the digits that it prints and a twentieth."""
+    """Check the largest sample against the text header, to the digits that it prints and a twentieth."""
     for row, line in enumerate(lines[at : at + _TEXT], at + 1):
         found = _PEAK.search(line)
         if found and found[2].lower() == "g" and unit == "g":

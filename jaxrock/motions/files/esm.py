@@ -54,7 +54,7 @@ class ESM(AbstractFormat):
 
 
 def _header(lines: list[str]) -> dict[str, tuple[int, str]]:
-    """Number of the line, and value, of every key; it ends with the first line that has none."""
+    """Return line number and value of every key; the header ends with the first line without a key."""
     header = {}
     for number, line in enumerate(lines, 1):
         found = _KEY.fullmatch(line.strip())
@@ -65,7 +65,7 @@ def _header(lines: list[str]) -> dict[str, tuple[int, str]]:
 
 
 def _stated(name: str, header: dict, key: str) -> float:
-    """A number that the header must state."""
+    """Return a number that the header must state."""
     line, value = header.get(key, (0, ""))
     if not re.fullmatch(NUMBER, value):
         raise file_error(name, f"header must state a number as {key}, but states {value!r}.")
@@ -77,14 +77,14 @@ def _number(line: str) -> list[float] | None:
 
 
 def _check_peak(name: str, header: dict, samples: np.ndarray, unit: str) -> None:
-    """The largest sample is the peak that the header states."""
+    """Check that the largest sample is the peak that the header states."""
     line, value = header.get(_PEAK, (0, ""))
     if re.fullmatch(NUMBER, value):
         check_peak(name, line, value, samples * (PER_G["cm/s2"] / PER_G[unit]))
 
 
 def _check_duration(name: str, header: dict, step: float, count: int) -> None:
-    """So many samples take what the header states as their duration [s]."""
+    """Check that the samples take the duration that the header states [s]."""
     line, value = header.get(_DURATION, (0, ""))
     if re.fullmatch(NUMBER, value) and abs(count * step - to_float(value)) > 2 * step + 0.01 * to_float(value):
         raise file_error(

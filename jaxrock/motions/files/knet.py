@@ -1,4 +1,4 @@
-"""K-NET and KiK-net, the format of NIED: lines of a header, then counts of a digitiser."""
+"""K-NET and KiK-net, the formats of NIED: lines of a header, then counts of a digitiser."""
 
 import re
 from datetime import datetime, timedelta
@@ -22,12 +22,12 @@ _KEYS = (
     "Max. Acc. (gal)", "Last Correction", "Memo.",
 )  # fmt: skip
 _TIME = "%Y/%m/%d %H:%M:%S"
-# Of KiK-net, which numbers its channels: in the borehole, and at the surface.
+# KiK-net numbers its channels: first those in the borehole, then those at the surface.
 _CHANNELS = {"1": "N-S", "2": "E-W", "3": "U-D", "4": "N-S", "5": "E-W", "6": "U-D"}
 
 
 class KNET(AbstractFormat):
-    """K-NET and KiK-net, without their offset: the mean of all samples is taken off, as it is from the stated peak."""
+    """K-NET and KiK-net, without their offset: the mean of all samples is subtracted, as it is in the stated peak."""
 
     name = "knet"
     suffixes = (".ew", ".ns", ".ud", ".ew1", ".ns1", ".ud1", ".ew2", ".ns2", ".ud2")
@@ -69,7 +69,7 @@ class KNET(AbstractFormat):
 
 
 def _start(recorded: str) -> str:
-    """When the first sample was taken, in Japan's time: the header states it 15 s late, as the logger delays it."""
+    """Return the time of the first sample, in Japan's time: the logger's delay makes the header state it 15 s late."""
     try:
         first = datetime.strptime(recorded, _TIME) - timedelta(seconds=15)
     except ValueError:
@@ -78,7 +78,7 @@ def _start(recorded: str) -> str:
 
 
 def _header(lines: list[str]) -> dict[str, tuple[int, str]]:
-    """Number of the line, and value, of every key."""
+    """Return line number and value of every key."""
     found = {}
     for number, line in enumerate(lines[:17], 1):
         key = next((key for key in _KEYS if line.startswith(key)), None)
@@ -89,7 +89,7 @@ def _header(lines: list[str]) -> dict[str, tuple[int, str]]:
 
 
 def _stated(name: str, header: dict, key: str, pattern: str) -> list[float]:
-    """Numbers that the header must state."""
+    """Return the numbers that the header must state."""
     line, value = header.get(key, (0, ""))
     found = re.fullmatch(pattern, value, re.IGNORECASE)
     if not found:
@@ -98,5 +98,5 @@ def _stated(name: str, header: dict, key: str, pattern: str) -> list[float]:
 
 
 def _counts(line: str) -> list[float] | None:
-    """Whole numbers in a line, or None if it holds anything else."""
+    """Return the whole numbers in a line, or None if it holds anything else."""
     return [float(word) for word in line.split()] if re.fullmatch(r"\s*[-+]?\d+(\s+[-+]?\d+)*\s*", line) else None

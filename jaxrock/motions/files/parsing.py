@@ -1,4 +1,4 @@
-"""What the formats have in common: numbers in text, units, and the comparison of header and arguments.
+"""Helpers of all formats: numbers in text, units, and the comparison of header and arguments.
 
 Nothing is guessed: where a header announces a count, a unit or a time step, contradictions raise.
 """
@@ -25,12 +25,12 @@ LIKE_DATA = re.compile(r"\s*[-+]?(?:\.?\d|nan\b|inf\b)", re.IGNORECASE)
 
 
 def to_float(text: str) -> float:
-    """A number in text, with the exponents of Fortran, too."""
+    """Convert a number in text, with Fortran's exponents, too."""
     return float(text.upper().replace("D", "E"))
 
 
 def agreed_step(name: str, given: float | None, stated: float) -> float:
-    """The time step, after a comparison of what the user and the file say [s]."""
+    """Return the time step [s], after a comparison of the user's and the file's."""
     if not 0 < stated < np.inf:
         raise file_error(name, f"states a time step of {stated:g} s, which is not positive.")
     if given is None:
@@ -46,7 +46,7 @@ def _spelling(written: str) -> str:
 
 
 def unit_named(written: str) -> str | None:
-    """The unit of acceleration, one of `PER_G`, that a word names; None for other words."""
+    """Return the unit of acceleration, one of `PER_G`, that a word names; None for other words."""
     return _SPELLINGS.get(_spelling(written))
 
 
@@ -56,7 +56,7 @@ def is_unit(written: str) -> bool:
 
 
 def agreed_unit(name: str, line: int, given: str | None, written: str) -> str:
-    """The unit, after a comparison of what the user and the header say (`written`, perhaps nothing)."""
+    """Return the unit, after a comparison of the user's and the header's (`written`, which may be empty)."""
     if not written:
         if given is None:
             told = f"Argument `unit` must be given for file `{name}`, whose header states none, but is None."
@@ -77,9 +77,9 @@ _TOUCHING = re.compile(r"(?<=[0-9.])(?=[-+])")
 
 
 def plain_numbers(lines: list[str]) -> np.ndarray | None:
-    """All numbers in lines that hold nothing else, at once; None where they have to be looked at one by one.
+    """Return all numbers in lines of numbers only, parsed at once; None where lines have to be parsed one by one.
 
-    As numbers are read over and over, this is quick; what it does not take is no error yet.
+    Parsing at once is quick, as files are read over and over. A text that it does not accept may still be valid.
     """
     text = "\n".join(lines)
     if not _PLAIN.fullmatch(text):
@@ -95,7 +95,7 @@ def plain_numbers(lines: list[str]) -> np.ndarray | None:
 
 
 def numbers_of_width(lines: list[str], width: int) -> np.ndarray | None:
-    """The same for lines of fields of one width, which may touch."""
+    """Return all numbers in fields of one width, which may touch; None where lines have to be parsed one by one."""
     lines = [line.rstrip() for line in lines if line.strip()]
     text = "".join(lines)
     if not text or "\t" in text or any(len(line) % width for line in lines) or not _PLAIN.fullmatch(text):
@@ -103,7 +103,7 @@ def numbers_of_width(lines: list[str], width: int) -> np.ndarray | None:
     data = text.upper().replace("D", "E").encode()
     written = np.frombuffer(data, np.uint8).reshape(-1, width) != ord(" ")
     if not (np.sum(written[:, 1:] > written[:, :-1], axis=1) + written[:, 0] == 1).all():
-        return None  # a field that is empty, or two in one
+        return None  # an empty field, or two numbers in one
     try:
         values = np.frombuffer(data, f"S{width}").astype(float)
     except ValueError:
@@ -112,14 +112,14 @@ def numbers_of_width(lines: list[str], width: int) -> np.ndarray | None:
 
 
 def data_lines(lines: list[str], start: int) -> list[str]:
-    """The lines from number `start` on that look like data: up to one that holds a word."""
+    """Return the lines from number `start` on that look like data, up to one that holds a word."""
     for number in range(start, len(lines)):
         if _NOT_PLAIN.search(lines[number]):
             return lines[start:number]
     return lines[start:]
 
 
-_ENDS = re.compile(r"POINTS OF|^\s*/&|^\s*End-of-data", re.IGNORECASE)  # what comes after the samples
+_ENDS = re.compile(r"POINTS OF|^\s*/&|^\s*End-of-data", re.IGNORECASE)  # lines that may follow the samples
 
 
 def announced_samples(
@@ -131,10 +131,10 @@ def announced_samples(
     at_once: Callable[[list[str]], np.ndarray | None] = lambda lines: None,
     what: str = "samples",
 ) -> np.ndarray:
-    """The `count` samples that must follow line number `start`, and nothing more.
+    """Return the `count` samples that must follow line number `start`, and nothing more.
 
-    `parse(line)`: the numbers in a line, or None if it holds anything else. `at_once(lines)`: those of all, or None
-    where lines have to be looked at one by one. `what`: the numbers are, in words.
+    `parse(line)`: the numbers in a line, or None if it holds anything else. `at_once(lines)`: the numbers of all lines,
+    or None where lines have to be parsed one by one. `what`: the meaning of the numbers, for messages.
     """
     block = data_lines(lines, start)
     rest = lines[start + len(block) :]
@@ -149,7 +149,7 @@ def announced_samples(
 
 
 def _one_by_one(name: str, lines: list[str], start: int, count: int, parse: Callable) -> list[float]:
-    """The numbers line by line, and what is wrong with them."""
+    """Return the numbers line by line, or raise for the first bad line."""
     values = []
     for number, line in enumerate(lines[start:], start + 1):
         if not line.strip():
@@ -171,13 +171,13 @@ def _one_by_one(name: str, lines: list[str], start: int, count: int, parse: Call
 def announced_columns(
     name: str, lines: list[str], start: int, count: int, width: int, what: str = "samples"
 ) -> np.ndarray:
-    """`announced_samples` in columns `width` wide, which may touch."""
+    """Return `announced_samples` from columns `width` wide, which may touch."""
     parse, at_once = functools.partial(fixed_numbers, width=width), functools.partial(numbers_of_width, width=width)
     return announced_samples(name, lines, start, count, parse, at_once, what)
 
 
 def fixed_numbers(line: str, width: int) -> list[float] | None:
-    """The numbers in a line of columns `width` wide, which may touch, or None if it holds anything else."""
+    """Return the numbers in a line of columns `width` wide, which may touch, or None if it holds anything else."""
     line = line.rstrip()
     if len(line) % width:
         return None
@@ -188,7 +188,7 @@ def fixed_numbers(line: str, width: int) -> list[float] | None:
 
 
 def no_column(name: str, column: int | None, kind: str) -> None:
-    """Raise ValueError where a column is asked for of a file that has one record."""
+    """Raise ValueError where a column is asked for in a file with one record."""
     if column is not None:
         one = f"{kind} file `{name}` has one record"
         raise ValueError(f"Argument `column` must be None, because {one}, but is {column}.")
@@ -197,7 +197,7 @@ def no_column(name: str, column: int | None, kind: str) -> None:
 def check_peak(
     name: str, line: int, stated: str | float, samples: np.ndarray, where: str = "", *, unit="cm/s2", share=1e-3
 ) -> None:
-    """The largest sample is the peak that a header states in a line, to a share of it and, in text, its last digit."""
+    """Check the largest sample against the stated peak, to a share of it and, in text, its last digit."""
     peak, largest = abs(to_float(str(stated))), float(np.abs(samples).max())
     if abs(largest - peak) > share * peak + max(1e-6, _last_digit(stated) if isinstance(stated, str) else 0.0):
         told = f"a peak of {peak:g} {unit}, but the largest sample is {largest:g}"
@@ -205,6 +205,6 @@ def check_peak(
 
 
 def _last_digit(printed: str) -> float:
-    """What one more in the last digit of a printed number is."""
+    """Return the value of one unit in the last digit of a printed number."""
     digits, _, power = printed.upper().replace("D", "E").partition("E")
     return 10.0 ** (int(power or 0) - len(digits.partition(".")[2]))

@@ -1,8 +1,8 @@
 """Accelerograms from files of any format: the table of formats, and `read_record`.
 
-A reader trusts only what the file says or the user states: it never guesses a unit or a time step, and where a header
-of a known format announces a count, a unit or a time step, contradictions raise. Of columns of text it takes units
-from titles, and time steps from a column of times: what comments say of a step ("# dt = 0.02") it does not read.
+A reader trusts only the file's and the user's statements. It never guesses a unit or a time step. Where a header of a
+known format announces a count, a unit or a time step, contradictions raise. Columns of text get units from titles, and
+time steps from a column of times. A time step in a comment ("# dt = 0.02") is not read.
 """
 
 import os
@@ -30,8 +30,8 @@ from jaxrock.motions.files.parsing import PER_G
 from jaxrock.motions.files.smc import SMC
 from jaxrock.motions.record import STRONGEST, Record, record_in_g
 
-# Formats that headers tell; another one is a line here. Each is asked before those above it: a V2 file may hold a
-# line that AT2 would take for its own, but hardly the other way round.
+# Formats with headers; a new format is a line here. Later ones are asked first: a V2 file may hold a line that looks
+# like AT2, but hardly the other way round.
 _WITH_HEADERS = (
     AT2(),
     CSMIP(),
@@ -50,7 +50,7 @@ FORMATS = {each.name: each for each in (*_WITH_HEADERS, _COLUMNS)}
 
 
 def _known_format(name: str, value: str) -> str:
-    return one_of(name, value, tuple(FORMATS))  # as the table is then
+    return one_of(name, value, tuple(FORMATS))  # read at the call, as formats may be added
 
 
 @arguments
@@ -71,18 +71,19 @@ def read_record(
       Strong-Motion database), "cosmos" (V1, V2, V2c), "smc" (USGS), "knet" (K-NET and KiK-net, without their offset),
       or "csv" (columns of text separated by commas, semicolons, tabs or blanks). None recognises it from the content,
       then from the suffix.
-    - `dt`: time between samples [s], positive. Needed for text without times, and for V1 files whose samples are not
-      equally spaced, which are followed along straight lines; elsewhere it must agree with the file to 1e-3.
+    - `dt`: time between samples [s], positive. Needed for text without times. Needed for V1 files whose samples are not
+      equally spaced: the record follows the straight lines between them. Elsewhere it must agree with the file to 1e-3.
     - `unit`: of the accelerations in the file, "g", "m/s2" or "cm/s2". Needed for text; elsewhere it
       must agree with the header.
     - `column`: counted from 0. Text: the column of accelerations, needed when there are more than two;
-      column 0 then holds the times, unless `column` is 0, or `dt` is given and column 0 also falls. What a header says
-      of columns counts: units of times and accelerations, and which are times.
+      column 0 then holds the times, unless `column` is 0, or `dt` is given and column 0 also falls. Titles in a header
+      count: units of times and accelerations, and which columns are times.
       V1, V2, COSMOS: the channel (None: the first). The others hold one record.
 
-    **Returns:** a `Record` in units of g = 9.80665 m/s^2, named after the header (or the file); its `origin` is what
-    the file says of it. Its first sample is at time 0, whatever the times in the file. It warns of samples beyond 20 g,
-    and of times without a unit that are more than 0.2 s apart.
+    **Returns:** a `Record` in units of g = 9.80665 m/s^2, named after the header (or the file); its `origin` holds the
+    file's metadata. Its first sample is at time 0, whatever the times in the file.
+
+    Samples beyond 3 g raise a warning, and so do times without a unit that are more than 0.2 s apart.
 
     **Raises:** OSError if the file cannot be opened; ValueError, with file and line, for one that is
     empty, binary or damaged; ValueError for an argument that is missing, not allowed, of no use for
@@ -96,13 +97,13 @@ def read_record(
 
 
 def accelerogram_of(name: str, lines: list[str]) -> tuple[str, Accelerogram]:
-    """The format of lines, and what they hold, where nothing is said beside them."""
+    """Return the format and the accelerogram of some lines, without arguments of the user."""
     chosen = _format_of(lines, "")
     return chosen.name, chosen.read(name, lines, None, None, None)
 
 
 def component_columns(path: str | os.PathLike, format: str | None = None) -> tuple[int, ...]:
-    """Which columns or channels of a file are the components of one record, where nobody says: no times among them."""
+    """Return the default columns or channels of a file for the components of one record, without times."""
     path = path_of("path", path)
     lines = text_lines(path)
     chosen = _format_of(lines, path.suffix) if format is None else FORMATS[_known_format("format", format)]
@@ -123,8 +124,8 @@ def _record(path: Path, kind: AbstractFormat, found: Accelerogram) -> Record:
 
 
 def _format_of(lines: list[str], suffix: str) -> AbstractFormat:
-    """The format of a file: by its content, else by its suffix, else columns."""
-    # Most lines of a long file hold numbers only, and are none of a header.
+    """Return the format of a file: by its content, else by its suffix, else columns."""
+    # Most lines of a long file hold numbers only, which no header line does.
     worded = lines[:_HEADER] + [line for line in lines[_HEADER:] if _WORDS.search(line)]
     for each in reversed(FORMATS.values()):
         if each.recognises(worded):

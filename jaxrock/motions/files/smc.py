@@ -20,7 +20,7 @@ _COMMENTS, _COUNT = 15, 16  # places among the whole numbers
 _RATE, _LARGEST, _SMALLEST = 1, 29, 31  # places among the real numbers: samples a second, peaks [cm/s2]
 _UNKNOWN = 1e38
 _WIDTH = 10
-# Thirty characters of a name stand between the two, with commas or none, and with blanks up to its end.
+# The name has thirty characters, with or without a comma before the component, and blanks up to its end.
 _STATION = re.compile(r"\s*station\s*=\s*(.*?)\s*(?:\bcomponent\s*=\s*(.*?)\s*)?$", re.IGNORECASE)
 
 
@@ -66,7 +66,7 @@ class SMC(AbstractFormat):
 
 
 def _whole(lines: list[str]) -> list[int] | None:
-    """The 48 whole numbers."""
+    """Return the 48 whole numbers of the header; None if it is not valid."""
     rows = [line.rstrip() for line in lines[_TEXT : _TEXT + _WHOLE]]
     if any(len(row) % _WIDTH or not re.fullmatch(r"[\s\d-]+", row) for row in rows):
         return None
@@ -77,14 +77,14 @@ def _whole(lines: list[str]) -> list[int] | None:
 
 
 def _real(lines: list[str]) -> list[float] | None:
-    """The 50 real numbers."""
+    """Return the 50 real numbers of the header; None if it is not valid."""
     rows = [fixed_numbers(line, 15) for line in lines[_TEXT + _WHOLE : _TEXT + _WHOLE + _REAL]]
     numbers = [x for row in rows if row is not None for x in row]
     return None if None in rows or len(numbers) != 50 else numbers
 
 
 def _origin(lines: list[str]) -> Origin:
-    """What the lines of text say: they have fixed places."""
+    """Return the origin from the text header, whose entries have fixed places."""
     station = _STATION.match(lines[5])
     time = re.match(r"\s*(\d+\s+\d+\s+\d+\s+\d+)\s+(.*)", lines[3].rstrip())
     return Origin(

@@ -1,4 +1,4 @@
-"""V3, the format of CSMIP for response spectra, which hold no accelerogram: what they are compared with."""
+"""V3, the CSMIP format for response spectra, which agencies publish beside accelerograms; it holds no accelerogram."""
 
 import os
 import re
@@ -20,7 +20,7 @@ _FOURIER = re.compile(r"^\s*FOURIER AMPLITUDE SPECTRA\b", re.IGNORECASE)
 _DAMPING = re.compile(rf"^\s*DAMPING\s*=\s*({NUMBER})\s*\.\s*DATA OF SD,\s*SV,\s*SA,\s*PSSV,\s*TT", re.IGNORECASE)
 _END = re.compile(r"^\s*/&.*END OF", re.IGNORECASE)
 _LENGTHS = {"inches": 0.0254, "in": 0.0254, "cm": 0.01}  # m
-_WIDTH, _ROOM, _ROWS = 10, 100, 13  # characters of a number, numbers of a list with its room, lines they take
+_WIDTH, _ROOM, _ROWS = 10, 100, 13  # characters of a number, numbers of a padded list, lines they take
 _KINDS = 7  # lists for each damping: four spectra, and the times of three
 
 
@@ -52,11 +52,11 @@ def read_spectra(path: str | os.PathLike, channel: Annotated[int, at_least(0)] =
     - `path`: the file.
     - `channel`: which of its channels, counted from 0.
 
-    **Returns:** a `ResponseSpectra`, to three digits: what `intensity.spectral_velocity` makes of a record.
+    **Returns:** a `ResponseSpectra`, to three digits, to compare with `intensity.spectral_velocity` of a record.
 
     **Raises:** OSError if the file cannot be opened; ValueError, with file and line, for one that is damaged or cut
-    short, for one that is no V3 file of CSMIP (COSMOS's is told as such), or whose pseudo-velocities are not those of
-    its displacements.
+    short, or whose pseudo-velocities are not those of its displacements. ValueError for a file that is no V3 file of
+    CSMIP; the message names COSMOS's as such.
     """
     path = path_of("path", path)
     name, lines = path.name, text_lines(path)
@@ -73,7 +73,7 @@ def read_spectra(path: str | os.PathLike, channel: Annotated[int, at_least(0)] =
 
 
 def _said(pattern: re.Pattern, line: str) -> re.Match:
-    """The match of a line that is known to match."""
+    """Return the match of a line that is known to match."""
     found = pattern.match(line)
     assert found is not None
     return found
@@ -113,7 +113,7 @@ def _of_channel(name: str, lines: list[str], start: int) -> ResponseSpectra:
 
 
 def _lists(name: str, lines: list[str], start: int, count: int) -> np.ndarray:
-    """The lists of one damping, (7, periods), without their room."""
+    """Return the lists of one damping, (7, periods), without their padding."""
     block = lines[: start + _KINDS * _ROWS]
     values = announced_columns(name, block, start, _KINDS * _ROOM, _WIDTH, "spectral values and their room")
     lists = values.reshape(_KINDS, _ROOM)
@@ -122,6 +122,6 @@ def _lists(name: str, lines: list[str], start: int, count: int) -> np.ndarray:
 
 
 def _check_room(name: str, values: np.ndarray, count: int) -> None:
-    """Beyond the periods there are zeros, and before them none of other signs."""
+    """Check that lists are zero beyond the periods, and nowhere negative."""
     if values[..., count:].any() or (values < 0).any():
         raise file_error(name, f"announces {count} periods, but the numbers of a list go on, or are below 0.")

@@ -1,6 +1,6 @@
-"""What the header of columns of text says: units, what the numbers of the first column are, directions of sensors.
+"""Titles of columns of text: units, the kind of the first column, directions of sensors.
 
-Nothing is guessed: what looks like another unit is refused, and so is a first column that is said to be no time.
+Nothing is guessed: a word that looks like another unit is refused, and so is a first column that is said to be no time.
 """
 
 import csv
@@ -15,7 +15,7 @@ from jaxrock.motions.files.parsing import is_unit, unit_named
 # A factor beside g: 0.1 g, g/10, 10^-3 g, percent of g.
 _FACTOR = r"(?:[-−+\d.,\s%‰^*/x×·()e]|per\s?cent|pct|per\s?mille?|milli|micro|of|times)*"
 _LENGTH = r"(?:[kcdmµμ]?m|in(?:ch(?:es)?)?|ft|feet|foot)"
-# Units that accelerations are not read in, or that are of something else: any speed or length, parts of g, volts.
+# Units that are refused for accelerations, or of other quantities: any speed or length, parts of g, volts.
 _SURE = (
     r"(%|milli|micro|[mµμu])[-\s]*(g|gals?)"
     rf"|{_FACTOR}(g|gals?){_FACTOR}"
@@ -39,7 +39,7 @@ _NO_DIRECTION = re.compile(r"\b(?:a|acc\w*|ground|motion|component|comp|sensor|o
 
 _BRACKETS = re.compile(r"\[([^\[\]]*)\]|\(((?:[^()]|\([^()]*\))*)\)|\{([^{}]*)\}|<([^<>]*)>")
 _BEFORE_BARE = re.compile(r"\s*[/:]\s*|\s+-\s+|[\s_]+(?:in[\s_]+)?")  # time_ms, t/ms, time in ms
-SHORT = {"m", "v", "in"}  # other units that are as well words or directions, where no brackets are around them
+SHORT = {"m", "v", "in"}  # other units that are also words or directions, where no brackets surround them
 _BEHIND_BRACKETS, _NOT_BEFORE_BRACKETS = re.compile(r"(?<=[\])}>])\s+"), re.compile(r"\s+(?![\[({<])")
 _MARK, _RULE = re.compile(r"^(?:[#%!]|//)+\s*"), re.compile(r"[-=_*+|~.:,;#\s]+")
 _SAID = re.compile(
@@ -55,10 +55,10 @@ _VALUED = re.compile(
     re.IGNORECASE,
 )
 _DIRECTION = re.compile(r"[NSEWUDVHXYZLTR]{1,3}\d?|[NSEWUD]-[NSEWUD]|\d{1,3}|up|down|vert\w*\.?", re.IGNORECASE)
-_VALUE = re.compile(r"(^|[\s=:])[-+\d.]+($|\s)")  # a number in what is no title then: `PGA = 0.3 g`
+_VALUE = re.compile(r"(^|[\s=:])[-+\d.]+($|\s)")  # a number, so no title: `PGA = 0.3 g`
 _STATED = re.compile(r"[:=]\s*[-+.]?\d")
 _OR = " or else "  # between units of one title
-_LONG = 300  # characters of a title, and of a line of titles times ten
+_LONG = 300  # characters of a title; ten times as many of a line of titles
 
 
 class Title(NamedTuple):
@@ -80,14 +80,17 @@ class Title(NamedTuple):
         return is_unit(self.unit) or _seconds(self.unit)
 
     def with_unit(self, unit: str) -> "Title":
-        """The title with a unit from elsewhere; what stands in its brackets, such as (NS), is a word then."""
+        """Return the title with a unit from elsewhere; its own text in brackets, such as (NS), then belongs to the
+        word.
+        """
         if not unit or is_any_unit(self.unit):
             return self
         return Title(f"{self.word} {self.unit}".strip(), unit)
 
 
 class Titles(NamedTuple):
-    """The line that titles columns, and what it says of each; none where no line has as many as there are columns.
+    """The line of column titles, and the title of each column; empty where no line has as many titles as there are
+    columns.
 
     `said`: units that the header states elsewhere, of accelerations and of times, each with its line.
     """
@@ -97,7 +100,7 @@ class Titles(NamedTuple):
     said: tuple[tuple[int, str], tuple[int, str]] = ((0, ""), (0, ""))
 
     def unit_of(self, name: str, column: int) -> tuple[int, str]:
-        """A line, and the unit that it states of a column; empty where there is none, or another word in brackets."""
+        """Return a line, and the unit that it states of a column; empty for none, or for another word in brackets."""
         written = self._of(column).unit
         written = written if is_unit(written) or _OTHER_UNIT.fullmatch(written) or _OR in written else ""
         line, elsewhere = self.said[0]
@@ -106,8 +109,11 @@ class Titles(NamedTuple):
         return (self.line, written) if written else (line, elsewhere)
 
     def seconds(self, name: str, numbers: np.ndarray) -> tuple[float, bool] | None:
-        """What the numbers of the first column are in [s], and whether that is stated; None where they count samples.
-        ValueError, if they are said to be something else."""
+        """Return the unit of the first column in seconds, and whether it is stated; None where the column counts
+        samples.
+
+        **Raises:** ValueError, if the header says that the numbers are something else.
+        """
         title = self._of(0)
         word, written = title.word.strip(" .").lower(), title.unit.lower().rstrip(".")
         if word in _SPECTRUM or written and written not in SECONDS:
@@ -116,7 +122,7 @@ class Titles(NamedTuple):
             raise file_error(name, f"{said}, but before accelerations there must be times in s, ms, us or min.")
         if written:
             return SECONDS[written], True
-        # A column without a title is how tables with a numbered row are written.
+        # Tables with a numbered row have a first column without a title.
         if word in _COUNTS or self.titles and not word and (np.diff(numbers) == 1).all():
             return None
         elsewhere = self.said[1][1].lower().rstrip(".")
@@ -131,7 +137,7 @@ class Titles(NamedTuple):
         return self._of(column).word.strip(" .").lower() in _COUNTS
 
     def direction(self, column: int) -> str:
-        """What a title says of the direction of its sensor."""
+        """Return the direction of a column's sensor, from its title."""
         title = self._of(column)
         word = " ".join(_NO_DIRECTION.sub(" ", title.word.replace("_", " ")).split())
         return word or (title.unit if _DIRECTION.fullmatch(title.unit) and not is_any_unit(title.unit) else "")
@@ -150,8 +156,10 @@ def _same(one: str, other: str) -> bool:
 
 
 def titles_of(name: str, lines: list[str], width: int, spare: bool) -> Titles:
-    """What the lines of a header say of so many columns. `spare`: whether rows end with an empty field, which has a
-    title of its own."""
+    """Read the titles of `width` columns from the lines of a header.
+
+    `spare`: whether rows end with an empty field, which has its own title.
+    """
     said = _said(lines, width)
     units, plain = said.pop("columns", None), None
     for number in range(len(lines), 0, -1):
@@ -177,7 +185,7 @@ def titles_of(name: str, lines: list[str], width: int, spare: bool) -> Titles:
 
 
 def _of_other_width(name, number: int, every: list[list[Title]], width: int, spare: bool) -> list[Title] | None:
-    """The titles of a line that has not as many as there are columns: refused, unless rows have an empty last field."""
+    """Refuse a line of titles in another number than the columns, unless rows have an empty last field."""
     for titles in every:
         of_times = titles[0].is_time or titles[0].bare
         if len(titles) > 1 and of_times and any(each.states_unit for each in titles):
@@ -189,7 +197,7 @@ def _of_other_width(name, number: int, every: list[list[Title]], width: int, spa
 
 
 def _with_units(name: str, number: int, titles, units: tuple[int, list[Title]] | None, said: dict) -> Titles:
-    """Titles with what a line of units says of them."""
+    """Combine titles with a line of units."""
     found = tuple(titles)
     if units:
         line, below = units
@@ -205,7 +213,9 @@ def _with_units(name: str, number: int, titles, units: tuple[int, list[Title]] |
 
 
 def _said(lines: list[str], width: int) -> dict:
-    """Units that lines state in words: `units: cm/s2`, `times in ms`; of every column, where there are as many."""
+    """Return units that lines state in words: `units: cm/s2`, `times in ms`; one for every column, if there are as
+    many.
+    """
     found: dict = {}
     for number, line in enumerate(lines, 1):
         begin = _SAID.search(line)
@@ -230,7 +240,7 @@ def _said(lines: list[str], width: int) -> dict:
 def _is_of_a_value(words: str) -> bool:
     """Return whether a unit is that of a value behind it, and says nothing of the columns."""
     found = _VALUED.match(words[:_LONG])
-    # Without a sign between them a number beside a unit of acceleration may be a factor.
+    # Without a sign between them, a number beside a unit of acceleration may be a factor.
     return found is not None and (is_any_unit if found[2] else _seconds)(_inner(found[1]))
 
 
@@ -254,7 +264,7 @@ def _only_units(titles: list[Title]) -> bool:
 
 
 def _parted(line: str, width: int) -> list[list[Title]]:
-    """A line in titles, in all ways in which it may be meant: they hold blanks, and units in brackets."""
+    """Split a line into titles, in all possible ways: titles hold blanks, and units in brackets."""
     marks = [mark for mark in "\t;," if mark in line]
     apart = [next(csv.reader([line], delimiter=mark, skipinitialspace=True)) for mark in marks[:2]]
     apart = [fields[:-1] if not fields[-1].strip() else fields for fields in apart]
@@ -265,7 +275,7 @@ def _parted(line: str, width: int) -> list[list[Title]]:
         words = line.split()
         plain = [Title("" if _is_bare(word) else word, word if _is_bare(word) else "") for word in words]
         bracketed = [_title(word) for word in words]
-        # Without a separator a word that may be a unit is one only among units.
+        # Without a separator, an ambiguous word is a unit only among units.
         found.append(plain if _only_units(plain) else [t if t.word else Title(w) for t, w in zip(bracketed, words)])
         for mark in (_BEHIND_BRACKETS, _NOT_BEFORE_BRACKETS):
             titles = [_title(field) for field in mark.split(line)]
@@ -274,14 +284,14 @@ def _parted(line: str, width: int) -> list[list[Title]]:
 
 
 def _inner(text: str) -> str:
-    """A unit without brackets around it."""
+    """Return a unit without brackets around it."""
     text = text.strip(" .:\"'")
     found = _BRACKETS.fullmatch(text)
     return next((part for part in found.groups() if part), "").strip() if found else text
 
 
 def _title(field: str) -> Title:
-    """A field of a line of titles."""
+    """Parse a field of a line of titles."""
     field = field.strip().strip("\"'").strip()[:_LONG]
     if not field:
         return Title()
@@ -300,7 +310,7 @@ def _title(field: str) -> Title:
 
 
 def _bare(field: str) -> Title:
-    """A title without brackets: `time_ms`, `t/ms`, `Acc in cm/s2`."""
+    """Parse a title without brackets: `time_ms`, `t/ms`, `Acc in cm/s2`."""
     if _is_bare(field):
         return Title("", field, True)
     for mark in _BEFORE_BARE.finditer(field):

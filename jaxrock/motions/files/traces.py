@@ -1,4 +1,4 @@
-"""Traces of ObsPy as records; ObsPy is not imported: a trace brings what is needed."""
+"""ObsPy traces as records, without an import of ObsPy: a trace carries all that is needed."""
 
 from typing import Annotated, Any
 
@@ -12,16 +12,16 @@ from jaxrock.motions.record import Origin, Record
 
 @arguments
 def record_of_trace(trace: Any, unit: Annotated[str, word_of(*PER_G)]) -> Record:
-    """A trace of ObsPy as a record: `[rk.motions.record_of_trace(trace, "m/s2") for trace in stream]`.
+    """Convert an ObsPy trace to a record: `[rk.motions.record_of_trace(trace, "m/s2") for trace in stream]`.
 
     **Arguments:**
 
     - `trace`: an `obspy.Trace` of accelerations without gaps, its instrument's response removed.
     - `unit`: of its samples, which a trace does not tell: "g", "m/s2" or "cm/s2".
 
-    **Returns:** a `Record`, whose `origin` is what the trace says of its station, channel and start.
+    **Returns:** a `Record`, whose `origin` holds the trace's station, channel and start.
 
-    **Raises:** ValueError for what is no trace, for one with gaps, or with samples that are not finite.
+    **Raises:** ValueError for another kind of value, for a trace with gaps, or with samples that are not finite.
     """
     stats, data = getattr(trace, "stats", None), getattr(trace, "data", None)
     if stats is None or data is None or not hasattr(stats, "delta"):

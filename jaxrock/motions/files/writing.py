@@ -15,7 +15,7 @@ from jaxrock.motions.record import Record
 
 
 def _line(text: str) -> str:
-    """A text in one line that a header may hold."""
+    """Return a text in one line that a header may hold."""
     return " ".join("".join(each if each.isprintable() else " " for each in text).split())
 
 
@@ -72,7 +72,9 @@ _TRIAL = np.array([0.125, -0.25, 0.5, -0.375])
 
 
 def _check_name(title: str, lines: list[str], record: Record, kind: str, unit: str) -> None:
-    """Raise ValueError where a short file with a title is not read as it was written: as it looks like a header."""
+    """Raise ValueError where a title looks like a header, so that a short file with it is not read as it was
+    written.
+    """
     try:
         found = accelerogram_of("trial", [*lines, ""])
         good = found[0] == kind and found[1].unit == unit and np.allclose(found[1].samples, _TRIAL * PER_G[unit])
