@@ -1,4 +1,4 @@
-"""Many scenes: a grid of points cut into blocks, over devices, processes and interruptions, and its results.
+"""Sweeps over many scenes: a grid of points in blocks, over devices, processes and interruptions, and its results.
 
-Imports `transforms`; knows nothing of blocks. Start with `sweep`, then `plan` and `runner`.
+Imports `transforms`; knows no physics of rocking blocks. Start with `sweep`, then `plan` and `runner`.
 """

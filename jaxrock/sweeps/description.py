@@ -1,4 +1,4 @@
-"""What a store says of itself: one text with its own checksum, twice on disk, by which all else in it is judged."""
+"""Description of a store: one text with its own checksum, kept twice, against which all other files are verified."""
 
 import dataclasses
 import functools
@@ -16,7 +16,7 @@ from jaxrock._regular_files import open_regular
 from jaxrock.keeping.facts import code, version_of
 from jaxrock.sweeps.labels import RECORDS, layout_name
 
-TWINS = ("zarr.json", f"{RECORDS}/store.json")  # the root of a Zarr group, and the same once more
+TWINS = ("zarr.json", f"{RECORDS}/store.json")  # the root of a Zarr group, and a second copy of it
 _ABOUT, _CHECKSUM = "jaxrock_store", "jaxrock_checksum"  # attributes
 _UNFINISHED, _FINISHED = "unfinished", "finished"
 
@@ -24,7 +24,7 @@ _UNFINISHED, _FINISHED = "unfinished", "finished"
 def fingerprint(
     axes: dict[str, np.ndarray], outer: bool, program: str, words: Mapping[str, Sequence[str]]
 ) -> dict[str, str]:
-    """What tells a sweep from others, part by part; `words`: of the axes that have words, which are numbered."""
+    """Identify a sweep, part by part; `words`: labels of the axes that have words, which are numbered."""
     hashes = {f"axis `{name}`": digest_of_axis(values) for name, values in axes.items()}
     hashes |= {f"words of axis `{name}`": _checksum({"words": list(told)}) for name, told in words.items()}
     return hashes | {
@@ -40,13 +40,13 @@ def fingerprint(
 
 
 def digest_of_axis(values: np.ndarray) -> str:
-    """What tells an axis."""
+    """Hash the type and the values of an axis."""
     return hashlib.sha256(f"{values.dtype}".encode() + values.tobytes()).hexdigest()
 
 
 @dataclasses.dataclass(frozen=True)
 class Description:
-    """The root of a store, all of it: it holds what all of its arrays say of themselves.
+    """The complete root of a store, including the metadata of all its arrays.
 
     - `root`: as in the file.
     """
@@ -83,12 +83,12 @@ class Description:
 
     @property
     def about(self) -> dict:
-        """Names of axes, types of results by their names, points of a block, what the store was made by."""
+        """Names of axes, types of results by their names, points of a block, and the fingerprint of the sweep."""
         return json.loads(self.root["attributes"][_ABOUT])
 
     @property
     def metadata(self) -> dict[str, dict]:
-        """What Zarr says of every array."""
+        """Zarr's metadata of every array."""
         return self.root["consolidated_metadata"]["metadata"]
 
     @functools.cached_property
@@ -111,7 +111,7 @@ class Description:
         return self._of(about if state == _UNFINISHED else about | {"state": state}, metadata)
 
     def files(self) -> dict[str, dict]:
-        """Every file, below the path of the store, that says something of it, and what it says."""
+        """Return the content of every file that describes the store, by its path below that of the store."""
         return {name: self.root for name in TWINS} | {f"{name}/zarr.json": said for name, said in self.metadata.items()}
 
     def damaged(self, path: Path) -> list[Path]:
@@ -131,7 +131,7 @@ class Description:
 
 
 def described(path: Path, wanted: str) -> Description:
-    """What is described at a path; `wanted`: the argument and what it must be, in words.
+    """Read the description at a path; `wanted`: the argument and its requirement, in words.
 
     **Raises:** ValueError where there is no store, or one whose description is lost.
     """

@@ -1,4 +1,4 @@
-"""The devices a surface is spread over: CPU cores or GPUs of this process, and the other processes of a job."""
+"""Devices that share a surface: CPU cores or GPUs of this process, and the other processes of a job."""
 
 import contextlib
 import functools
@@ -16,7 +16,7 @@ from jaxtyping import UInt8
 from jaxrock._arguments import arguments, at_least
 from jaxrock._precision import setting
 
-# Wide vectors and fused multiply-add; NaN, infinity and division stay honest. The engine's tests run with them.
+# Wide vectors and fused multiply-add; NaN, infinity and division keep IEEE semantics. The engine's tests run with them.
 _CPU_OPTIONS = {
     "xla_cpu_prefer_vector_width": 512,
     "xla_cpu_enable_fast_math": True,
@@ -41,7 +41,7 @@ def use_cpu_devices(count: Annotated[int | None, at_least(1, 2**16)] = None) -> 
 
     **Returns:** the number of devices.
 
-    **Raises:** ValueError for a count below 1; RuntimeError if JAX has begun to compute with another number of devices.
+    **Raises:** ValueError for a count below 1; RuntimeError if JAX already computes with another number of devices.
     """
     if count is None:
         count = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
@@ -58,28 +58,28 @@ def use_cpu_devices(count: Annotated[int | None, at_least(1, 2**16)] = None) -> 
 
 
 def local_devices() -> tuple[jax.Device, ...]:
-    """Devices of this process that share the work: all of the default backend, or the one chosen as default."""
+    """Return the devices of this process that share the work: those of the default backend, or the default device."""
     chosen = setting("jax_default_device")
     return (chosen,) if isinstance(chosen, jax.Device) else tuple(jax.local_devices(backend=chosen))
 
 
 @functools.cache
 def compiler_options(platform: str) -> dict | None:
-    """Options of a compiled call, where this platform and this jaxlib know them."""
+    """Return options of a compiled call if this platform and this jaxlib support them."""
     if platform != "cpu":
         return None
     try:
         jax.jit(lambda x: x + 1, compiler_options=_CPU_OPTIONS)(1.0)
-    except Exception:  # reported by an internal error type
+    except Exception:  # jaxlib reports an unknown option by an internal error type
         return None
     return _CPU_OPTIONS
 
 
-# Many processes: they run the same program, and meet where it says so.
+# All processes of a job run the same program, and synchronise where it calls `meet`.
 
 
 def process() -> tuple[int, int]:
-    """Number of this process, and how many there are."""
+    """Return the index of this process, and the number of processes."""
     return jax.process_index(), jax.process_count()
 
 
@@ -89,9 +89,11 @@ _sharing = threading.RLock()
 
 @contextlib.contextmanager
 def shared_out() -> Iterator[None]:
-    """What many processes share: one at a time in each of them, as they meet by the order of what they share.
+    """Guard work that many processes share: each process runs one such piece of work at a time.
 
-    **Raises:** RuntimeError where another thread is at it.
+    Processes match their barriers by the order of the calls, so two threads must not mix theirs.
+
+    **Raises:** RuntimeError where another thread is at such work.
     """
     if jax.process_count() == 1:
         yield
@@ -105,25 +107,27 @@ def shared_out() -> Iterator[None]:
 
 
 def meet() -> None:
-    """Wait until all processes are here."""
+    """Wait until all processes have called this function."""
     if jax.process_count() == 1:
         return
-    # A collective of devices would give up after some seconds; the service that started the processes waits.
+    # A collective of devices gives up after some seconds; the service that started the processes waits.
     from jax._src.distributed import global_state
 
     client: Any = global_state.client
     client.wait_at_barrier(f"jaxrock-{next(_meetings)}", _PATIENCE * 1000)
 
 
-_SAID = 400  # bytes of what the others hear of an error
+_SAID = 400  # bytes of an error message that reach the other processes
 
 
 @contextlib.contextmanager
 def all_or_none() -> Iterator[None]:
-    """What every process does by itself, and then meets the others: an error in one of them is one in all, as the
-    others would go on to wait for it. (An interrupt is not: it would have to wait for them.)
+    """Run a part in every process, then synchronise: an error in one process is raised in all.
 
-    **Raises:** RuntimeError where another process failed, with what it said.
+    Without this the other processes would wait for the failed one. An interrupt is not passed on, because its process
+    would have to wait for the others.
+
+    **Raises:** RuntimeError where another process failed, with its message.
     """
     if jax.process_count() == 1:
         yield
@@ -139,7 +143,7 @@ def all_or_none() -> Iterator[None]:
 
 
 def _heard(said: str) -> list[str]:
-    """What every process says, in few bytes."""
+    """Exchange a short message with all processes; return all messages."""
     meet()
     brought = np.zeros(_SAID, np.uint8)
     told = np.frombuffer(said.encode()[:_SAID], np.uint8)
@@ -148,7 +152,7 @@ def _heard(said: str) -> list[str]:
 
 
 def exchange(own: UInt8[np.ndarray, " bytes"]) -> UInt8[np.ndarray, "processes bytes"]:
-    """What every process brought along, to all of them; the same length everywhere."""
+    """Return an array of every process to all of them; the length is equal everywhere."""
     mesh, copy = _one_device_each()
     dealt = NamedSharding(mesh, PartitionSpec("processes"))
     here = jax.device_put(own[None], mesh.local_devices[0])
@@ -158,7 +162,10 @@ def exchange(own: UInt8[np.ndarray, " bytes"]) -> UInt8[np.ndarray, "processes b
 
 @functools.cache
 def _one_device_each() -> tuple[Mesh, Callable]:
-    """One device of every process (their numbers may differ), and what copies an array across them to all."""
+    """Return a mesh of one device per process, and a function that copies an array across it to all.
+
+    Processes may differ in their number of devices.
+    """
     first = {device.process_index: device for device in reversed(jax.devices())}
     mesh = Mesh(np.array([first[number] for number in sorted(first)]), ("processes",))
     return mesh, jax.jit(lambda x: x, out_shardings=NamedSharding(mesh, PartitionSpec()))

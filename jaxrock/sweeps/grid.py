@@ -1,4 +1,4 @@
-"""Results over labelled axes, and their way into files and xarray."""
+"""Results over labelled axes, their files, and their conversion to xarray and pandas."""
 
 import threading
 from collections.abc import Callable
@@ -27,10 +27,10 @@ class Grid(eqx.Module):
     """Results of a sweep over labelled axes.
 
     - `axes`: values of every axis by name; of one along a suite, the names of its motions.
-    - `values`: what the function returns, an `Outcome` or any pytree, as NumPy arrays in host memory. The first axes
-      of every array are those of the grid, in their order; one axis if they went side by side.
+    - `values`: the function's results, an `Outcome` or any pytree, as NumPy arrays in host memory. The first axes of
+      every array are those of the grid, in their order; one axis if the axes went side by side.
     - `outer`: whether the points are the outer product of the axes; else the axes go side by side.
-    - `resumed`: how many points had been computed before, and came from a store.
+    - `resumed`: number of points that a store already held.
     """
 
     axes: dict[str, Shaped[np.ndarray, " n"]]
@@ -48,12 +48,12 @@ class Grid(eqx.Module):
         return f"Grid({layout_name(self.outer)}, {sizes}; {', '.join(names_of(self.values))})"
 
     def to_xarray(self) -> "xarray.Dataset":
-        """The results as an `xarray.Dataset`: one variable for each result, the axes as coordinates.
+        """Convert the results to an `xarray.Dataset`: one variable for each result, the axes as coordinates.
 
         **Returns:** the dataset; `status` is a number there, the position of its message in `Status`.
 
-        **Raises:** ImportError without xarray; ValueError where two of axes, results and dimensions are called the
-        same, or files have no such names.
+        **Raises:** ImportError without xarray; ValueError where two of axes, results and dimensions have one name, or a
+        name that files cannot have.
         """
         xarray = needed("xarray")
         variables = {
@@ -66,7 +66,7 @@ class Grid(eqx.Module):
         return xarray.Dataset(variables, coordinates, {"layout": layout_name(self.outer)})
 
     def to_pandas(self) -> "pandas.DataFrame":
-        """The results as a `pandas.DataFrame`, indexed by the axes: a column for each result, a status in words.
+        """Convert the results to a `pandas.DataFrame` indexed by the axes: a column for each result, a status in words.
 
         **Raises:** as `to_xarray`; ImportError without pandas.
         """
@@ -79,7 +79,7 @@ class Grid(eqx.Module):
         return frame
 
     def _leaves(self) -> dict[str, np.ndarray]:
-        """Results by names that files can have."""
+        """Return results by names that files can have."""
         names = own_names(list(self.axes), self.outer, self.values, len(self.shape))
         found = {name: np.asarray(leaf) for name, leaf in zip(names, jax.tree.leaves(self.values))}
         for name, leaf in found.items():
@@ -88,7 +88,7 @@ class Grid(eqx.Module):
         return found
 
     def save(self, path: str | Path) -> None:
-        """Write the results to a new file, all of it or nothing; with checksums, which `load` verifies.
+        """Write the results to a new file, completely or not at all, with checksums that `load` verifies.
 
         **Arguments:**
 
@@ -138,7 +138,7 @@ class Grid(eqx.Module):
 
     @classmethod
     def load(cls, path: str | Path) -> "Grid":
-        """Read results that were saved, or the store of a sweep that has finished; all checksums are verified.
+        """Read saved results, or the store of a finished sweep; all checksums are verified.
 
         **Arguments:**
 
@@ -146,7 +146,7 @@ class Grid(eqx.Module):
 
         **Returns:** a `Grid`. Values are an `Outcome` again, or a dictionary by names.
 
-        **Raises:** ValueError for a store that is not finished, and for what is damaged, with the path of it;
+        **Raises:** ValueError for a store that is not finished, and for a damaged file, with its path;
         FileNotFoundError; ImportError without xarray, h5netcdf or zarr.
         """
         path = local("path", path)
@@ -163,27 +163,27 @@ _examples: list[Callable[[], Any]] = []
 
 
 def known_again(example: Callable[[], Any]) -> None:
-    """Let `Grid.load` give results of a kind back as what they were: a file keeps their names only.
+    """Register a kind of results that `Grid.load` rebuilds: a file keeps only the names of their arrays.
 
     **Arguments:**
 
-    - `example`: makes one of this kind, with numbers of any values; called when something is loaded.
+    - `example`: makes a result of this kind with arbitrary numbers; called when a file is loaded.
     """
     _examples.append(example)
 
 
 def _in_order(values: np.ndarray) -> np.ndarray:
-    """Return values in this machine's byte order, as stores have them."""
+    """Return values in this machine's byte order, as stores hold them."""
     return values.astype(values.dtype.newbyteorder("="), copy=False)
 
 
 def _known(values: np.ndarray) -> np.ndarray:
-    """An axis of a file, whose words are objects there."""
+    """Return an axis of a file; files hold words as objects."""
     return values.astype(str) if values.dtype.kind == "O" else values
 
 
 def _rebuilt(values: dict[str, np.ndarray]) -> Any:
-    """Results of a kind that is known, if the names are its; else the dictionary."""
+    """Rebuild results of a registered kind if their names match; else return the dictionary."""
     for example in _examples:
         like = example()
         names = names_of(like)

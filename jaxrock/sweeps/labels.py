@@ -1,4 +1,4 @@
-"""How axes, results and their dimensions are called, in memory and in files."""
+"""Names of axes, results and dimensions, in memory and in files."""
 
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
@@ -13,30 +13,30 @@ _LONGEST = 200  # bytes of a name: file systems allow 255
 
 
 def shape_of(axes: Iterable[np.ndarray], outer: bool) -> tuple[int, ...]:
-    """Shape of the grid that axes span."""
+    """Return the shape of the grid that axes span."""
     sizes = tuple(np.size(values) for values in axes)
     return sizes if outer else sizes[:1]
 
 
 def numbered(axes: Mapping[str, np.ndarray]) -> tuple[dict[str, np.ndarray], dict[str, tuple[str, ...]]]:
-    """Axes in numbers alone, and the words of those that have words: they are numbered as they stand."""
+    """Return all axes as numbers, and the words of axes that have words; words are numbered in their order."""
     words = {name: tuple(map(str, values)) for name, values in axes.items() if np.asarray(values).dtype.kind in "OU"}
     numbers = {name: np.arange(len(words[name])) if name in words else values for name, values in axes.items()}
     return numbers, words
 
 
 def layout_name(outer: bool) -> str:
-    """How files call it."""
+    """Return the name of a layout in files."""
     return "outer" if outer else "side by side"
 
 
 def dimensions(axes: Iterable[str], outer: bool, name: str, more: int) -> tuple[str, ...]:
-    """Names of the dimensions of a result that has some more than the grid."""
+    """Return the names of the dimensions of a result that has `more` dimensions than the grid."""
     return (*(axes if outer else (POINT,)), *(f"{name}.{k}" for k in range(more)))
 
 
 def names_of(values: Any) -> list[str]:
-    """A name for every array of a pytree: its path, such as `max_rotation` or `outcome.status`."""
+    """Name every array of a pytree by its path, such as `max_rotation` or `outcome.status`."""
     paths = [
         jax.tree_util.keystr(p, simple=True, separator=".") for p, _ in jax.tree_util.tree_leaves_with_path(values)
     ]
@@ -44,9 +44,9 @@ def names_of(values: Any) -> list[str]:
 
 
 def own_names(axes: Sequence[str], outer: bool, values: Any, grid: int) -> list[str]:
-    """Names of the arrays of a pytree, whose first `grid` dimensions are those of the grid: such as files can have.
+    """Name the arrays of a pytree for files; their first `grid` dimensions are those of the grid.
 
-    **Raises:** ValueError where two of axes, results and dimensions are called the same, or files have no such names.
+    **Raises:** ValueError where two of axes, results and dimensions have one name, or a name that files cannot have.
     """
     names, leaves = names_of(values), jax.tree.leaves(values)
     if not names:
@@ -70,7 +70,7 @@ def own_names(axes: Sequence[str], outer: bool, values: Any, grid: int) -> list[
 
 
 def _can_be_stored(name: str) -> bool:
-    """By NetCDF, Zarr and file systems."""
+    """Return whether NetCDF, Zarr and file systems accept a name."""
     plain = name.isprintable() and name == name.strip() and not set(name) & {"/", "\\"}
     reserved = name in ("", ".", "..") or name.startswith("__") or name.endswith(".json")
     return plain and not reserved and len(name.encode()) <= _LONGEST

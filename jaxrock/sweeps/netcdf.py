@@ -1,7 +1,7 @@
-"""NetCDF files that end with a checksum of all that stands before it; readers of NetCDF do not look there.
+"""NetCDF files that end with a checksum of all preceding bytes; readers of NetCDF ignore it.
 
-The whole file is verified before HDF5 sees it: the C library may end the process over a damaged file, and over one that
-it cannot write.
+The whole file is verified before HDF5 reads it: the C library may abort the process over a damaged file, and over one
+that it cannot write.
 """
 
 import hashlib
@@ -17,7 +17,7 @@ _DIGEST = hashlib.sha256().digest_size
 
 
 class _Patient:
-    """A file that HDF5 can always write and close: the first error is kept, and the rest goes nowhere.
+    """A file that HDF5 can always write and close: the first error is kept, and later calls do nothing.
 
     HDF5 cannot close a file that it could not write, and Python ends with a segmentation fault when it tries again.
     """
@@ -39,14 +39,14 @@ class _Patient:
     def _write(self, at: int, data) -> None:
         self._file.seek(at)
         view = memoryview(data).cast("B")
-        while view:  # a disk that is nearly full takes a part
+        while view:  # a disk that is nearly full accepts only a part
             view = view[self._file.write(view) :]
 
     def _read(self, at: int, buffer) -> int:
         self._file.seek(at)
         return self._file.readinto(buffer)
 
-    # What h5py calls.
+    # The methods that h5py calls.
 
     _at = 0
 
@@ -57,21 +57,21 @@ class _Patient:
         return self._at
 
     def tell(self) -> int:
-        """Where it is."""
+        """Return the current position."""
         return self._at
 
     def read(self, size: int = -1) -> bytes:
-        """Only to be known as a file: h5py reads into its own memory."""
+        """Make h5py recognise this object as a file; h5py itself reads into its own memory."""
         raise NotImplementedError
 
     def readinto(self, buffer) -> int:
-        """Read what was written."""
+        """Read into a buffer."""
         count = self._try(self._read, self._at, buffer) or 0
         self._at += count
         return count
 
     def write(self, data) -> int:
-        """Write, or remember why not."""
+        """Write, or keep the error."""
         size = memoryview(data).nbytes
         self._try(self._write, self._at, data)
         self._at += size
@@ -83,11 +83,11 @@ class _Patient:
         return size
 
     def flush(self) -> None:
-        """Nothing waits in memory."""
+        """Do nothing: writes are unbuffered."""
 
 
 def write(dataset, path: Path, stopped: threading.Event) -> None:
-    """Write an `xarray.Dataset` to a new file, all of it or nothing; nothing where it is stopped."""
+    """Write an `xarray.Dataset` to a new file, completely or not at all; write nothing if `stopped` is set."""
     h5netcdf, backends = needed("h5netcdf"), needed("xarray.backends")
     with written_aside(path) as aside, aside.open("w+b", buffering=0) as file:
         patient = _Patient(file, stopped)
@@ -104,9 +104,9 @@ def write(dataset, path: Path, stopped: threading.Event) -> None:
 
 
 def opened(path: Path):
-    """The `xarray.Dataset` of a file that is as it was written.
+    """Return the `xarray.Dataset` of an undamaged file.
 
-    **Raises:** ValueError for one that is not.
+    **Raises:** ValueError for a damaged one.
     """
     xarray = needed("xarray")
     needed("h5netcdf")

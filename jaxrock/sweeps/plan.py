@@ -1,4 +1,4 @@
-"""A grid of points, its blocks, and the order in which points are computed."""
+"""Grid of points, its blocks, and the order in which points are computed."""
 
 import functools
 import math
@@ -10,17 +10,17 @@ from jaxrock.sweeps.labels import shape_of
 
 _CHUNK = 64  # neighbours that are dealt to a device together
 _TILE = 8  # and their extent along each of the last two axes of a grid
-# Lanes of a compiled call on a CPU, and how often such a call is made before a larger one is: each size is compiled,
-# which takes longer than these calls.
+# Lanes of a compiled call on a CPU, and the most calls of that size before a larger size is taken. Each size is
+# compiled, which takes longer than these calls.
 _CALLS = {_CHUNK: 1, 2 * _CHUNK: 4, 2**10: 8, 2**14: math.inf}
 _GPU_LANES = 2**10, 2**16  # the least and the most, in powers of two
 _SMALLEST_BLOCK = 65536
 _LARGEST_BLOCK = 2**18  # bounds the memory, whatever the size of the grid
-_BLOCKS = 64  # of a grid, if it is large: what a killed job loses at most, and what is dealt to processes
+_BLOCKS = 64  # of a large grid: a killed job loses at most one of them per process, and processes share them
 
 
 class Plan(NamedTuple):
-    """A grid of points and its blocks: tiles of `block` points along every axis, the last of an axis may be smaller."""
+    """Grid of points and its blocks: tiles of `block` points along every axis; the last of an axis may be smaller."""
 
     axes: tuple[np.ndarray, ...]
     outer: bool
@@ -28,13 +28,13 @@ class Plan(NamedTuple):
 
     @classmethod
     def of(cls, axes: tuple[np.ndarray, ...], outer: bool, points: int | None = None) -> "Plan":
-        """Blocks of about so many points: whole rows of the last axes, where they fit."""
+        """Plan blocks of about `points` points: whole rows of the last axes, if they fit."""
         shape = shape_of(axes, outer)
         room = points or min(max(_SMALLEST_BLOCK, math.prod(shape) // _BLOCKS), _LARGEST_BLOCK)
         block = []
         for size in reversed(shape):
             parts = -(-size // max(room, 1))
-            block.insert(0, -(-size // parts))  # parts of like size
+            block.insert(0, -(-size // parts))  # parts of nearly equal size
             room //= block[0]
         return cls(axes, outer, tuple(block))
 
@@ -55,12 +55,12 @@ class Plan(NamedTuple):
         return functools.reduce(np.multiply.outer, lengths).ravel()
 
     def place(self, number: int) -> tuple[slice, ...]:
-        """Where a block lies in the grid."""
+        """Return the slices of a block in the grid."""
         index = np.unravel_index(number, self.blocks)
         return tuple(slice(int(i) * p, min((int(i) + 1) * p, n)) for i, p, n in zip(index, self.block, self.shape))
 
     def points(self, number: int) -> list[np.ndarray]:
-        """The flat points of a block."""
+        """Return the flat points of a block."""
         place = self.place(number)
         if not self.outer:
             return [values[place[0]] for values in self.axes]
@@ -69,10 +69,10 @@ class Plan(NamedTuple):
 
 
 def layout(points: int, devices: int, platform: str) -> tuple[int, int]:
-    """Shape of a batch: devices, lanes; of few different ones, each of which is compiled.
+    """Return the shape of a batch, (devices, lanes): one of few shapes, each of which is compiled.
 
-    Few scenes go without a quick pass (`transforms.batching`), which leaves other last digits: whether these are few
-    is told by the points, not by how many devices share them.
+    Few scenes skip the quick pass (`transforms.batching`), which changes last digits. Whether they are few depends on
+    the points, not on the number of devices that share them.
     """
     share = -(-points // devices)
     if platform != "cpu":
@@ -83,7 +83,7 @@ def layout(points: int, devices: int, platform: str) -> tuple[int, int]:
 
 
 def deal(points: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
-    """Flat points, device by device. Chunks are dealt in turn: neighbours cost alike, so shares do, too."""
+    """Reorder flat points device by device, dealing chunks in turn: neighbours cost alike, so the shares cost alike."""
     devices, lanes = shape
     if devices == 1:
         return points
@@ -92,14 +92,16 @@ def deal(points: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
 
 @functools.lru_cache(maxsize=16)
 def dealt_to(shape: tuple[int, int]) -> list[np.ndarray]:
-    """Which of a batch's points every device has, in its order."""
+    """Return the points of a batch that each device has, in its order."""
     return list(deal(np.arange(math.prod(shape)), shape).reshape(shape))
 
 
 @functools.lru_cache(maxsize=16)
 def tiles(shape: tuple[int, ...], columns: bool) -> np.ndarray:
-    """The order of a block's flat points in which neighbours along both of its last axes are near each other, those
-    along the last (`columns`: the last but one) nearest."""
+    """Order a block's flat points so that neighbours along its last two axes are near each other.
+
+    Neighbours along the last axis are nearest (`columns`: along the last but one).
+    """
     if len(shape) < 2:
         return np.arange(math.prod(shape))
     *rest, i, j = (x.ravel() for x in np.indices(shape))

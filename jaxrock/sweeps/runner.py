@@ -1,4 +1,4 @@
-"""One compiled function of a batch of points, dealt to the devices."""
+"""Compiled function of a batch of points, dealt to the devices."""
 
 import collections
 import functools
@@ -16,22 +16,26 @@ from jaxrock.sweeps.plan import deal, dealt_to, layout
 from jaxrock.transforms.fingerprint import Checked, Program, with_checks
 
 _EVERYWHERE, _DEALT = PartitionSpec(), PartitionSpec("devices")
-# Points of light functions, and these times numbers of their scene, that take less time than to compile them well
-# (`benchmarks/fits.md`).
+# A function marked `light` is compiled briefly for at most `_FEW` points, and at most `_LITTLE` points times numbers of
+# its scene: these take less time than a thorough compilation (`benchmarks/fits.md`).
 _FEW, _LITTLE = 2**14, 2_000_000
 _LIGHT = "_follows_one_rigid_block"
 
 
 def light(function: Callable) -> Callable:
-    """Decorate a function of a point that follows one rigid block: where no machine code is made of it, XLA compiles it
-    for as long as thousands of points take."""
+    """Mark a function of a point that follows one rigid block.
+
+    Where it gets no machine code of its own, XLA compiles it for as long as thousands of points take.
+    """
     setattr(function, _LIGHT, True)
     return function
 
 
 class Runner:
-    """One compiled function of a batch of points; call it with any number of flat points: so many at once, at most,
-    and so many in all (None: no more)."""
+    """Compiled function of a batch of points; call it with any number of flat points.
+
+    `points`: the most points of one call; `in_all`: the most points of all calls (None: `points`).
+    """
 
     def __init__(self, function: Callable, axes: tuple[np.ndarray, ...], scene, points: int, in_all: int | None = None):
         devices = local_devices()
@@ -53,14 +57,16 @@ class Runner:
         report: Callable[[int], None] = lambda more: None,
         order: np.ndarray | None = None,
     ) -> list[np.ndarray]:
-        """Results at flat points: the leaves of what the function returns, as NumPy arrays; `order`: in which they are
-        computed."""
+        """Return results at flat points: the leaves of the function's result, as NumPy arrays.
+
+        `order`: the order in which points are computed.
+        """
         order = np.arange(points[0].size) if order is None else order
         results = [np.empty((order.size, *x.shape), x.dtype) for x in self.shapes]
         for numbers, leaves in self._batches(points, order):
             for device, dealt in enumerate(dealt_to(self._layout)):
                 own = [self._of_device(part, device) for part in leaves]
-                if dealt[-1] < numbers.size:  # its share of a batch that is full
+                if dealt[-1] < numbers.size:  # this share is complete
                     targets = numbers[dealt]
                 else:
                     there = dealt < numbers.size
@@ -75,7 +81,7 @@ class Runner:
         return results
 
     def _at_hand(self, tree):
-        """Arrays where the function is computed; what is on its only device already goes as it is."""
+        """Put arrays on the devices of the computation; arrays that already are on the only device stay."""
         devices = self._mesh.devices.ravel()
         if devices.size > 1:
             return jax.device_put(tree, NamedSharding(self._mesh, _EVERYWHERE))
@@ -86,7 +92,7 @@ class Runner:
         return jax.tree.map(put, tree)
 
     def _of_device(self, dealt: jax.Array, device: int) -> np.ndarray:
-        """One device's part of results: its own memory, where that can be read."""
+        """Return one device's part of the results, without a copy where its memory can be read."""
         if self._mesh.size == 1:
             return np.asarray(dealt)
         begin = device * self._layout[1]
@@ -96,7 +102,7 @@ class Runner:
         return np.asarray(shard.data)
 
     def _batches(self, points: list[np.ndarray], order: np.ndarray) -> Iterator[tuple[np.ndarray, list[jax.Array]]]:
-        """Numbers of points, and their results. One batch is under way while the one before it is taken."""
+        """Yield numbers of points and their results; one batch is under way while the one before it is read."""
         waiting, batch = collections.deque(), math.prod(self._layout)
         for begin in range(0, order.size, batch):
             numbers = order[begin : begin + batch]
@@ -127,8 +133,8 @@ class _Compiled(NamedTuple):
     shapes: list[jax.ShapeDtypeStruct]
 
 
-# A function is a `Program`, known by its text, or one of the package, of which there is one: what a user gives lies in
-# the scene, a pytree, by whose structure `jax.jit` tells programs apart.
+# The cache key is a `Program`, identified by its text, or a function of the package, which exists once. User input
+# lies in the scene, a pytree, by whose structure `jax.jit` tells programs apart.
 @functools.lru_cache(maxsize=64)
 def _compiled(
     function: Callable,
@@ -140,7 +146,7 @@ def _compiled(
     few: bool,
     brief: bool,
 ) -> _Compiled:
-    """`function(*point, scene)` at a batch of points of these kinds of numbers, and what is known of it beforehand."""
+    """Compile `function(*point, scene)` for batches of points of these types; also return its result shapes."""
     at_first = few and mesh.size == 1
     call = _call_of(function, mesh, at_first)
     like = [jax.ShapeDtypeStruct((math.prod(shape),), kind) for kind in kinds]
@@ -151,8 +157,10 @@ def _compiled(
 
 
 class _AtFirst:
-    """A function of a batch of few points on one device, compiled for its first batch as what is in it wants it;
-    `brief`: in the least time, also if it has loops."""
+    """Function of a batch of few points on one device; its first batch chooses the compiler options.
+
+    `brief`: compile in the least time, even if the function has loops.
+    """
 
     def __init__(self, function: Any, mesh: Mesh, brief: bool):
         self._function, self._brief, self._compiled = function, brief, None
@@ -161,7 +169,7 @@ class _AtFirst:
     def __call__(self, *batch):
         if self._compiled is None:
             lowered = self._function.lower(*batch)
-            # Where no loop is left, scenes are machine code of their own, and what is around them takes a moment.
+            # Without loops, scenes are machine code of their own, and the program around them is compiled quickly.
             quick = self._platform == "cpu" and (self._brief or "stablehlo.while" not in lowered.as_text())
             self._compiled = lowered.compile(quick_options() if quick else compiler_options(self._platform))
         return self._compiled(*batch)
@@ -169,8 +177,10 @@ class _AtFirst:
 
 @functools.lru_cache(maxsize=32)
 def _call_of(function: Callable, mesh: Mesh, at_first: bool) -> Callable:
-    """`function(*point, scene)` over points that are dealt to devices, `_Checked`; XLA's options are told now, or where
-    it is compiled `at_first`."""
+    """Return `function(*point, scene)` over points dealt to devices, with `Checked` results.
+
+    XLA's options are set here, or at compilation if `at_first`.
+    """
 
     def on_one(points, scene):
         def one(*point):

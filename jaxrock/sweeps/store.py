@@ -1,8 +1,8 @@
 """Long sweeps on disk: a Zarr store of finished blocks, which many processes write, and which outlives them.
 
-A block is finished when its record is there: a checksum for each of its results, and one for these, written after all
-of them in a file of its own. Whatever is read is held against it. What a store is made of is told by its description,
-and every file is written aside and renamed.
+A block is finished when its record exists: a checksum for each of its results, and one for these checksums. The record
+is a file of its own, written after all results. Every read is verified against it. The description tells what a store
+contains. Every file is written under a temporary name and then renamed.
 """
 
 import hashlib
@@ -25,14 +25,14 @@ from jaxrock.sweeps.plan import Plan
 from jaxrock.sweeps.stored import stored
 
 _DIGEST = hashlib.sha256().digest_size
-_URL = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+:(/|:)")  # a letter alone is a drive
+_URL = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+:(/|:)")  # a single letter is a drive
 _MANY = 5  # files that a message names
 _AXIS_CHUNK = 2**20
 _WORDS = "words"  # an attribute of an axis: what its numbers stand for
 
 
 def local(argument: str, path: Any) -> Path:
-    """A path of a file system, or ValueError."""
+    """Return a path of a file system, or raise ValueError."""
     told = os.fspath(path) if isinstance(path, (str, os.PathLike)) else path
     if not isinstance(told, str) or not told or "\0" in told:
         raise ValueError(f"Argument `{argument}` must be a path, but is {path!r}.")
@@ -49,7 +49,7 @@ class Store:
 
     def __init__(self, path: Path, description: Description):
         self.path, self._description, self._about = path, description, description.about
-        self.mended: list[Path] = []  # files that were damaged when it was taken up
+        self.mended: list[Path] = []  # files found damaged when the store was opened
         self.outer = self._about["made_by"]["layout"] == layout_name(True)
         self.names = list(self._about["results"])
         self._types = [np.dtype(kind) for kind in self._about["results"].values()]
@@ -60,7 +60,7 @@ class Store:
         self._plan = Plan(tuple(axes), self.outer, tuple(self._about["block"]))  # where blocks lie
 
     def _array(self, name: str):
-        """An array of this store as its description has it; blocks are written even where they hold nothing new."""
+        """Open an array of this store by its description; blocks are written even where they equal the fill value."""
         zarr = needed("zarr")
         place = zarr.storage.StorePath(zarr.storage.LocalStore(self.path), name)
         return zarr.Array(zarr.AsyncArray(self._metadata[name], place, {"write_empty_chunks": True}))
@@ -76,13 +76,13 @@ class Store:
         return math.prod(self._plan.blocks)
 
     def axis(self, name: str) -> np.ndarray | None:
-        """Values of an axis; None if they are damaged."""
+        """Return the values of an axis; None if they are damaged."""
         values = self._part(self._array(name), ...)
         good = values is not None and digest_of_axis(values) == self._about["made_by"][f"axis `{name}`"]
         return values if good else None
 
     def axes(self) -> dict[str, np.ndarray]:
-        """All axes; in words, where they have words.
+        """Return all axes; as words, where they have words.
 
         **Raises:** ValueError where one is damaged.
         """
@@ -92,7 +92,7 @@ class Store:
         return {name: np.array(words[name]) if words[name] else np.asarray(found[name]) for name in found}
 
     def mend(self, axes: dict[str, np.ndarray]) -> list[Path]:
-        """Write again what is damaged of axes and description; which files these were."""
+        """Rewrite damaged axes and description; return the files that were damaged."""
         damaged = self._description.damaged(self.path)
         self._description.write(self.path)
         lost = [name for name in axes if self.axis(name) is None]
@@ -106,8 +106,11 @@ class Store:
         self._description.write(self.path)
 
     def begun(self) -> list[int]:
-        """The blocks of which there is a record, good or not: to look for one after the other takes long where there
-        are many, and few of them are finished. What lies beside them is nobody's."""
+        """Return the blocks that have a record, intact or not.
+
+        Walking the folder is faster than opening every block's record where there are many blocks, few of them
+        finished. Other files beside the records are ignored.
+        """
         root, found, blocks = self.path / RECORDS / "c", [], self._plan.blocks
         more = len(self._records.shape) - len(blocks)
         for folder, _, files in os.walk(root, onerror=_unless_missing):
@@ -119,12 +122,12 @@ class Store:
         return sorted(found)
 
     def look(self, number: int) -> tuple[bool, list[Path]]:
-        """Return whether a block is finished and good, and its files that are damaged."""
+        """Return whether a block is finished and intact, and its damaged files."""
         leaves, damaged = self._read(number)
         return leaves is not None, damaged
 
     def write(self, number: int, leaves: list[np.ndarray]) -> None:
-        """Write one block: its results, and when all are there, its record."""
+        """Write one block: first all its results, then its record."""
         place = self._plan.place(number)
         leaves = [leaf.astype(kind, copy=False) for kind, leaf in zip(self._stored, leaves)]
         for array, leaf in zip(self._arrays, leaves):
@@ -133,7 +136,7 @@ class Store:
         self._records[self._index(number)] = np.stack([*told, self._digest(number, RECORDS, told)])
 
     def read(self) -> list[np.ndarray]:
-        """All results.
+        """Read all results.
 
         **Raises:** ValueError for a store that is not finished, or damaged.
         """
@@ -159,7 +162,7 @@ class Store:
         return tuple(int(i) for i in np.unravel_index(number, self._plan.blocks))
 
     def _read(self, number: int) -> tuple[list[np.ndarray] | None, list[Path]]:
-        """Results of a block, None if they are not there, and its files that are damaged."""
+        """Return the results of a block (None if they are missing or damaged), and its damaged files."""
         record = self._part(self._records, self._index(number))
         if record is not None and not record.any():
             return None, []
@@ -176,21 +179,21 @@ class Store:
 
     @staticmethod
     def _part(array, place) -> np.ndarray | None:
-        """A part of an array; None where it cannot be read."""
+        """Return a part of an array; None if it cannot be read."""
         try:
             return np.asarray(array[place])
         except (OSError, MemoryError):
             raise
-        except Exception:  # whatever a codec says of it
+        except Exception:  # codecs raise their own error types
             return None
 
     def _file(self, name: str, number: int) -> Path:
-        """The file of a block."""
+        """Return the file of a block."""
         more = len(self._metadata[name]["shape"]) - len(self._plan.blocks)
         return self.path.joinpath(name, "c", *map(str, (*self._index(number), *(0,) * more)))
 
     def _digest(self, number: int, name: str, leaf: np.ndarray) -> np.ndarray:
-        """What a result of a block must be like, in this store and at this place."""
+        """Compute the checksum of a result, bound to this store, this block and the result's name."""
         told = hashlib.sha256(f"{self._description.checksum} {number} {name} ".encode())
         told.update(leaf.tobytes())
         return np.frombuffer(told.digest(), np.uint8)
@@ -202,7 +205,7 @@ def _unless_missing(error: OSError) -> None:
 
 
 def listed(files: list[Path]) -> str:
-    """The first of some files, and how many more there are."""
+    """List the first of some files, and the number of the others."""
     return ", ".join(map(str, files[:_MANY])) + (f", and {len(files) - _MANY} more" if len(files) > _MANY else "")
 
 
@@ -215,9 +218,9 @@ def _refuse(path: Path, damaged: list[Path]) -> None:
 
 
 def opened(path: Path) -> Store:
-    """A store that is there to be read.
+    """Open an existing store for reading.
 
-    **Raises:** ValueError where there is none, or one that does not say of itself what it should.
+    **Raises:** ValueError where there is none, or one whose files differ from its description.
     """
     description = described(path, "Argument `path` must be the store of a sweep or a saved grid")
     _refuse(path, description.damaged(path))
@@ -225,7 +228,7 @@ def opened(path: Path) -> Store:
 
 
 def of_sweep(path: Path, made_by: dict[str, str]) -> Store:
-    """The store of a sweep.
+    """Open the store of a sweep.
 
     **Raises:** ValueError for a store of another sweep, or anything else at this path.
     """
@@ -249,7 +252,7 @@ def made_or_mended(
     made_by: dict[str, str],
     words: Mapping[str, Sequence[str]],
 ) -> list[Path]:
-    """See that there is a store of a sweep, whose axes and description are good; which files were damaged."""
+    """Make the store of a sweep, or mend its axes and description; return the files that were damaged."""
     return uninterrupted(_made_or_mended, path, axes, outer, leaves, block, made_by, words)
 
 
@@ -260,7 +263,7 @@ def _made_or_mended(path, axes, outer, leaves, block, made_by, words) -> list[Pa
             with written_aside(path) as aside:
                 create(aside, axes, outer, leaves, block, made_by, words)
             return []
-        except FileExistsError:  # somebody was faster
+        except FileExistsError:  # another process made it first
             pass
     return of_sweep(path, made_by).mend(axes)
 
@@ -276,7 +279,7 @@ def create(
     *,
     whole: bool = False,
 ) -> Store:
-    """Make a store in which no block is done.
+    """Make a store without finished blocks.
 
     `leaves`: results by name, as of one point; `words`: labels of the numbers of axes; `whole`: all blocks are written
     before the store is read.
@@ -288,7 +291,7 @@ def create(
                 f"A store takes numbers and booleans, and axes of real numbers, but `{name}` is {values.dtype}."
             )
     group = zarr.open_group(zarr.storage.LocalStore(path), mode="w-", zarr_format=3)
-    # Damaged bytes are found before anything decompresses them.
+    # The outer checksum finds damaged bytes before a codec decompresses them.
     usual: dict[str, Any] = {"compressors": (zarr.codecs.ZstdCodec(level=0), zarr.codecs.Crc32cCodec())}
     usual["config"] = {"write_empty_chunks": True}
     shape = shape_of(axes.values(), outer)
@@ -307,7 +310,7 @@ def create(
             attributes={_WORDS: list(words[name])} if name in words else {}, **usual,
         )  # fmt: skip
         array[...] = values
-    # Its own chunk for every block: two processes never write the same file.
+    # Every block has its own chunk, so that two processes never write the same file.
     blocks = Plan(tuple(axes.values()), outer, block).blocks
     group.create_array(
         RECORDS, shape=(*blocks, len(leaves) + 1, _DIGEST), dtype=np.uint8, fill_value=0,

@@ -1,8 +1,12 @@
-"""Many scenes: points of labelled axes, in blocks of few compiled shapes, over devices, processes and interruptions.
+"""Sweeps over labelled axes: points in blocks of few compiled shapes, over devices, processes and interruptions.
 
-Three sizes: a *chunk* of neighbours steps together on one core (see `lanes`); a *batch* of chunks, dealt to the devices
-in turn, is one compiled call; a *block* of batches is a tile of the grid that is computed, written to a store, and
-dealt to the processes as a whole. A point's result depends on nobody else's, so it is the same however they are dealt.
+There are three sizes:
+
+- A *chunk* of neighbours steps together on one core (see `lanes`).
+- A *batch* of chunks, dealt to the devices in turn, is one compiled call.
+- A *block* of batches is a tile of the grid. It is computed, written to a store, and dealt to a process as a whole.
+
+A point's result depends on no other point, so it is the same however points are dealt.
 """
 
 import math
@@ -87,22 +91,22 @@ def sweep(
       last axis are computed together. An axis may be a `Suite`: the function gets its motions, which share their
       samples, and their names are the axis.
     - `outer`: every combination of the axes (default), or the axes side by side, all of one length.
-    - `store`: path of a Zarr store. Finished blocks are kept there: a sweep that was killed goes on where it was when
-      it is called again. What is there is held against its checksums first; what is damaged is named in a warning, and
+    - `store`: path of a Zarr store, which keeps finished blocks. A killed sweep continues from them when it is called
+      again. Existing files are first verified against their checksums; a warning names damaged ones, whose contents are
       computed again. All processes of a job use the same path. Needs `pip install "jaxrock[store]"`.
-    - `load`: whether to return the results. They can stay in the store, if they are too many for the memory.
-    - `block`: points that are computed, written and dealt to a process at a time; None: as many as fit well, between
-      65,536 and 262,144. Besides the results, memory is needed for one block. A killed job loses one block per process.
+    - `load`: whether to return the results. They can stay in the store if they exceed the memory.
+    - `block`: number of points that are computed, written and dealt to a process at a time; None: chosen between 65,536
+      and 262,144. Besides the results, memory is needed for one block. A killed job loses one block per process.
     - `progress`: whether to draw a progress bar; None: on a terminal, if it takes long.
-    - `version`: what tells the function from others in a store, besides its program. It has to be given for a function
-      that calls back to Python (`jax.pure_callback`), where the program does not tell what is computed.
+    - `version`: identifies the function in a store, besides its traced program. It is required for a function that
+      calls back to Python (`jax.pure_callback`), whose program does not show what is computed.
 
     **Returns:** a `Grid`, the same in every process; None if the results stay in the store.
 
     **Raises:** ValueError for axes that are not lists of numbers, for values that the function refuses, for results
     without names of their own, for a store of another sweep, or one that is no path of a file system (`s3://...`);
-    OSError where the store cannot be written, on a full disk, say; RuntimeError in a job of many processes for a second
-    sweep at a time, and for what failed in another of them; ImportError for a store without zarr.
+    OSError where the store cannot be written, for example on a full disk; RuntimeError in a job of many processes for a
+    second sweep at a time, and for a failure in another process; ImportError for a store without zarr.
     """
     if not axes:
         raise ValueError("A sweep needs at least one axis, such as `p=[1.0, 2.0]`.")
@@ -149,8 +153,8 @@ def _keeper(
     program: str,
     version: str | None,
 ) -> Store:
-    """The store at a path: made or mended by the first process; a sweep's own, in every process."""
-    needed("zarr")  # said by every process, before the first of them makes anything
+    """Open the store at a path in every process; the first process makes or mends it."""
+    needed("zarr")  # raises in every process before the first of them makes a file
     made_by = fingerprint(axes, plan.outer, program, words)
     if version is not None:
         made_by["argument `version`"] = str(version)
@@ -165,9 +169,9 @@ def _keeper(
 
 
 def _there(store: Store) -> np.ndarray:
-    """Return whether every block of a store is finished: each is verified by one of the processes, and all hear of it.
+    """Return whether every block of a store is finished: each is verified by one process, which shares the result.
 
-    What is damaged is named in a warning, and not there.
+    Damaged files are named in a warning, and their blocks count as missing.
     """
     own, count = process()
     found = np.zeros(store.count, np.uint8)
@@ -243,11 +247,12 @@ def surface(
     columns: bool = False,
     names: tuple[str, ...] | None = None,
 ):
-    """`function(*point, scene)` over axes that are known to be good; arrays of JAX, the shape of the grid in front.
-    `columns`: neighbours along the last axis but one are computed together. `names`: of a dictionary of results those
-    that are wanted.
+    """Evaluate `function(*point, scene)` over valid axes; return JAX arrays with the shape of the grid in front.
 
-    Within `jax.jit`, `jax.vmap` or a derivative it is the plain function of arrays, on the device that JAX takes.
+    `columns`: neighbours along the last axis but one are computed together. `names`: keys to keep of a dictionary of
+    results.
+
+    Within `jax.jit`, `jax.vmap` or a derivative it is the plain function of arrays, on the device that JAX chooses.
     """
     traced = is_traced((axes, scene))
     if traced:
@@ -261,7 +266,7 @@ def surface(
 def known_surface(
     function: Callable, axes: tuple, scene, label: str, progress: bool | None, outer: bool = True, columns: bool = False
 ):
-    """The same where nothing is traced: arrays of NumPy."""
+    """Evaluate `surface` for concrete arguments; return NumPy arrays."""
     plan = Plan.of(tuple(np.asarray(values) for values in axes), outer)
     return compute(function, plan, scene, label, progress, columns=columns)[0]
 
@@ -284,9 +289,9 @@ def compute(
     load: bool = True,
     columns: bool = False,
 ) -> tuple[Any, int]:
-    """`function(*point, scene)` on a grid: results as NumPy arrays, and how many points a store had already.
+    """Evaluate `function(*point, scene)` on a grid; return NumPy arrays, and the number of points from a store.
 
-    With many processes each takes its turn of the blocks; every process returns all.
+    With many processes each computes its share of the blocks, in turn; every process returns all results.
     """
     run = Runner(function, plan.axes, scene, math.prod(plan.block), math.prod(plan.shape))
     own, count = process()
@@ -325,7 +330,7 @@ def compute(
 
 
 def _at_once(run: Runner, plan: Plan, label: str, progress: bool | None, columns: bool):
-    """The same of a grid that is one block, where there is one process and nothing is kept."""
+    """Compute a grid of one block, in a job of one process without a store."""
     bar = Progress(math.prod(plan.shape), label, progress)
     leaves = run(plan.points(0), bar.add, tiles(plan.shape, columns))
     return jax.tree.unflatten(run.tree, [leaf.reshape(*plan.shape, *leaf.shape[1:]) for leaf in leaves])
@@ -340,7 +345,7 @@ def _mark(store: Store, state: str) -> None:
 
 
 def _kept(store: Store, write: Callable, *given) -> None:
-    """Write to a store; an error says that finished blocks are kept."""
+    """Write to a store; a raised error says that finished blocks are kept."""
     try:
         uninterrupted(write, *given)
     except OSError as error:
@@ -349,7 +354,7 @@ def _kept(store: Store, write: Callable, *given) -> None:
 
 
 def _gather(results: list[np.ndarray], plan: Plan, numbers: list[int]) -> None:
-    """Give every process the blocks of all, a round of one block each at a time."""
+    """Give every process the blocks of all, in rounds of one block per process."""
     own, count = process()
     largest = sum(math.prod(plan.block) * leaf.itemsize * math.prod(leaf.shape[len(plan.shape) :]) for leaf in results)
     for begin in range(0, len(numbers), count):
