@@ -1,12 +1,12 @@
-"""All tests run in double precision, on two devices, so that surfaces are shared out.
+"""Fixtures of all tests, which run in double precision and on two devices, so that surfaces are shared out.
 
-Shapes in annotations are checked where a module states any, of the first calls of every function, and seldom after
+Shapes in annotations are checked where a module states any, on the first calls of every function and seldom after
 them (`references.checked_shapes`). With JAXROCK_CHECK_ALL=1 all calls are checked, in all modules.
 
-XLA compiles as after `keep_compiled`, and then as quickly as it can, since nearly every program runs once: that takes
-half of the time or less. LLVM does so with machine code of our own, whose numbers are the same to the bit
-(`test_native.py`, `test_at_any_effort`). With `XLA_FLAGS=` both compile as they do for users; LLVM does so in processes
-that tests start, too.
+XLA compiles as after `keep_compiled`, and then with the least effort, since nearly every program runs once: this takes
+half of the time or less. LLVM does so for the package's own machine code, whose results are identical to the bit
+(`test_native.py`, `test_at_any_effort`). With `XLA_FLAGS=` both compile as they do for users. LLVM also does so in
+processes that tests start.
 """
 
 import atexit
@@ -52,7 +52,7 @@ def pytest_addoption(parser):
 
 
 def pytest_configure(config):
-    """Get ready to run tests; what only deals them out to others needs nothing of that."""
+    """Configure a process that runs tests; a controller that only distributes them needs no configuration."""
     skips = importlib.import_module("references.skipped_tests")
     config.pluginmanager.register(skips.SkippedTests(allowed=not config.option.no_skips))
     if config.getoption("tx", None) and config.getoption("dist") != "no" and not config.option.collectonly:
@@ -90,9 +90,11 @@ _PROGRAMS = 64  # of a context, which they make greater: it stays as long as one
 
 
 def _share_contexts(mlir):
-    """JAX before 0.12 makes a context of MLIR for each program, most of its memory, and holds it as long as that. Here
-    programs of a thread share some: one more for each program that is being made while another is, since what JAX makes
-    then would come to stand in that other."""
+    """Let the programs of a thread share MLIR contexts, which hold most of the memory of compiled programs.
+
+    JAX before 0.12 makes a context for each program and holds it as long as the program. A program that is made while
+    another is being made gets a context of its own, since JAX's objects would otherwise end up in the other's context.
+    """
     made, current, mine = mlir.make_ir_context, mlir.ir.Context, threading.local()
 
     def shared():
@@ -110,8 +112,8 @@ def _share_contexts(mlir):
     mlir.make_ir_context = shared
 
 
-# Bytes that a worker holds before it forgets compiled programs, if it has grown by so many since it last did: after the
-# last test of a file, and within one, where the next test may need what was compiled for this.
+# Bytes that a worker may hold before it forgets compiled programs, and growth since it last did so: after the last test
+# of a file, and within a file, where the next test may need programs compiled for this one.
 _AFTER_A_FILE, _WITHIN, _LEAST_GROWTH = 1.3e9, 1.4e9, 2e8
 _MOST_MAPS = 30_000
 _TESTS = 50  # after so many it is looked how many maps there are, for to read them takes as long as a small test
@@ -120,7 +122,7 @@ _OF_C = ctypes.CDLL(None) if os.name == "posix" else None
 
 
 def _memory() -> float:
-    """Bytes that this process holds; zero where that cannot be told."""
+    """Return the bytes that this process holds; zero where the system does not tell."""
     told = Path("/proc/self/statm")
     return int(told.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") if told.exists() else 0.0
 
@@ -136,8 +138,10 @@ def _has_many_maps() -> bool:
 
 @pytest.hookimpl(trylast=True)
 def pytest_runtest_teardown(item, nextitem):
-    """Forget compiled programs before they are too many: each takes memory, and maps pages, and past 65,530 maps XLA
-    crashes on Linux."""
+    """Forget compiled programs before they are too many: each takes memory and maps pages.
+
+    Beyond 65,530 maps XLA crashes on Linux.
+    """
     goes_on = nextitem is not None and nextitem.path == item.path
     most = max(_WITHIN if goes_on else _AFTER_A_FILE, _held[0] + _LEAST_GROWTH)
     if not _has_many_maps() and _memory() <= most:
@@ -153,20 +157,22 @@ def pytest_runtest_teardown(item, nextitem):
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_protocol(item, nextitem):
-    """As pytest does it, with room for the frames of all that a test calls. Plugins that run tests in another way
-    (again, if they fail) are not asked."""
+    """Run a test as pytest does, with room for the frames of all functions that a test calls.
+
+    Plugins that run tests in another way (again, if they fail) are not asked.
+    """
     return importlib.import_module("jaxrock._undisturbed").with_room(protocol, item, nextitem)
 
 
 def pytest_collection_finish():
-    """What all modules have made by now stays: the collector need not look at it again."""
+    """Exclude the objects that all modules have made from garbage collection: they stay."""
     gc.collect()
     gc.freeze()
 
 
 @pytest.hookimpl(trylast=True)
 def pytest_sessionfinish():
-    """At the end pytest looks for garbage five times, and Python twice: once is enough, for what is left stays."""
+    """Reduce the garbage collections at exit (pytest runs five, Python two) to one: the remaining objects stay."""
     gc.collect()
     gc.freeze()
 

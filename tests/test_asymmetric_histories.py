@@ -79,7 +79,7 @@ def test_what_is_fitted_of_itself_are_the_parameters_of_the_law(law, names):
 
 
 def test_one_number_is_the_restitution_of_both_sides():
-    """Of an asymmetric block, too: by name, with its range, and as what is fitted of itself."""
+    """Check one restitution for both sides of an asymmetric block: by name, with its range, and as a fitted value."""
     law, motion = rk.restitution.Constant(0.9), rk.SinePulse(0.4, 0.6)
     block = rk.blocks.AsymmetricBlock(0.2, 0.3, 2.5, restitution=law)
     values = named(block, motion)

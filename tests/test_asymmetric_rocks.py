@@ -1,4 +1,4 @@
-"""Rocks whose sides differ say what symmetric ones say, and which way round they stood may be anybody's guess."""
+"""Asymmetric rocks agree with symmetric ones; the way a rock stood may be unknown."""
 
 import equinox as eqx
 import jax
@@ -10,7 +10,7 @@ import jaxrock as rk
 from jaxrock.command_line.main import main
 from jaxrock.inverse.scatter import rocks_at
 
-# All tests have twelve rocks, of one of which at least it is not known how it stood: they share one compiled program.
+# All tests use twelve rocks, so that they share one compiled program; for at least one the way it stood is unknown.
 ALPHA = np.array([0.10, 0.12, 0.14, 0.16, 0.18, 0.20, 0.22, 0.24, 0.26, 0.28, 0.31, 0.34])
 P = np.array([3.0, 2.2, 3.6, 2.6, 4.2, 3.1, 2.4, 5.0, 3.4, 2.8, 4.5, 3.8])
 FACING = np.array([1.0, -1.0, 0.0] * 4)
@@ -49,7 +49,7 @@ def test_equal_sides_are_symmetric_rocks():
 
 
 def test_observations_of_traced_rocks():
-    """Where it is not known which way round they stand, they are taken both ways."""
+    """Check that rocks whose way of standing is unknown count both ways, also when traced."""
     known, ways = rocks(), jax.jit(lambda facing: rocks(facing=facing).ways)
     found = jax.jit(lambda ratio: rocks(ratio).restitution)(1.35)
     np.testing.assert_allclose(found, known.restitution, rtol=1e-14)
@@ -59,7 +59,7 @@ def test_observations_of_traced_rocks():
 
 @pytest.mark.parametrize("motion", [rk.SinePulse, with_vertical])
 def test_ways_are_those_of_the_mirrored_rock_and_their_mean(motion):
-    """What turns round does so in the plane: up stays up."""
+    """Check that a rock turned round is its mirror image in the plane: up stays up."""
     known = FACING != 0
     few = MOTIONS if motion is rk.SinePulse else {name: values[1:2] for name, values in MOTIONS.items()}
     one, other, unknown = (facts(rocks(facing=f), motion, few) for f in (FACING, -FACING, np.zeros(12)))
@@ -158,7 +158,7 @@ def fallen(sign, amplitude, period, alpha1, alpha2, p1, inertia_ratio):
 
 
 def overturned(**scenes):
-    """The verdict on scenes given by lists that go together: no likelihood, no margin."""
+    """Return the verdicts of scenes given by parallel lists, without likelihood or margin."""
     shape = np.broadcast_shapes(*(np.shape(x) for x in scenes.values()))
     lists = {name: np.broadcast_to(x, shape).ravel() for name, x in scenes.items()}
     return rk.sweep(fallen, outer=False, progress=False, **lists).values["fallen"].reshape(shape)
@@ -166,7 +166,7 @@ def overturned(**scenes):
 
 @pytest.mark.slow
 def test_probabilities_are_shares_of_verdicts():
-    """Of 1,000 possible scenes, with a coin for every rock of which it is not known how it stood."""
+    """Compare probabilities with shares of 1,000 drawn scenes; a coin decides each way of standing that is unknown."""
     words, rng = ["survived"] * 12, np.random.default_rng(0)
     seen = rocks(words=words)
     e, coin = rng.normal(size=(4, 1000, 1, 12)), rng.choice([-1.0, 1.0], size=(1000, 1, 12))
@@ -185,7 +185,7 @@ def test_probabilities_are_shares_of_verdicts():
 
 
 def test_up_stays_up_in_the_unexceeded_motion():
-    """Of rocks that stand the other way round, and of their mirror images."""
+    """Check that up stays up for rocks that stand the other way round, as for their mirror images."""
 
     def motion(amplitude, duration):
         return rk.SinePulse(amplitude, duration).with_vertical(rk.SinePulse(0.6 * amplitude, 0.7 * duration))
@@ -202,7 +202,7 @@ def test_up_stays_up_in_the_unexceeded_motion():
 
 @pytest.mark.slow
 def test_unexceeded_motions_of_two_sides():
-    """Of a rock that may stand either way round the larger one; and up to it the rock does stand, that way."""
+    """Check that the unexceeded motion of a rock of unknown way is the larger one, up to which it stands that way."""
     durations = np.array([0.5, 1.2])
     one, other, unknown = (
         rk.inverse.unexceeded_motion(rocks(facing=f, words=["survived"] * 12), rk.SinePulse, durations, progress=False)

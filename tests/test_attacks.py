@@ -1,7 +1,7 @@
-"""What nobody meant: bad arguments for every public name, and damaged files for every reader (see `references`).
+"""Attacks: bad arguments for every public name, and damaged files for every reader (see `references`).
 
-Each is right, or refused by name; never an internal error, and never silence. In processes of their own, because the
-checks of annotations that tests switch on would speak before the package does.
+Each call is right, or refused by name; never an internal error, and never silence. Attacks run in processes of their
+own, because the annotation checks that tests switch on would raise before the package does.
 """
 
 import functools
@@ -43,7 +43,7 @@ def attacked(*attacks: tuple) -> list[dict]:
 
 @pytest.mark.parametrize("count", [60, pytest.param(300, marks=pytest.mark.slow)])
 def test_bad_arguments(count):
-    """Of what compiles little; every public name is attacked, or stands among those nobody calls with arguments."""
+    """Attack functions that compile little; every public name is attacked or listed as never called with arguments."""
     found, *_ = attacked(*FEW) if count == 60 else attacked(("bad_inputs", count, 1, "cheap"))
     assert found["tried"] >= count
     assert not found["found"], json.dumps(found["found"], indent=1)
@@ -52,7 +52,7 @@ def test_bad_arguments(count):
 
 @pytest.mark.slow
 def test_many_bad_arguments():
-    """Of what compiles much, too. By hand none was found among 5,000 of each of the first two either."""
+    """Attack functions that compile much, too; 5,000 manual attacks on each of the first two found no fault either."""
     for found in attacked(*(("bad_inputs", 800, seed) for seed in (101, 102, 103, 104))):
         assert found["tried"] >= 800
         assert not found["found"], json.dumps(found["found"], indent=1)

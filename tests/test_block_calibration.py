@@ -41,7 +41,7 @@ def _outcomes(alpha, amplitude, period):
 
 
 def outcomes(*scenes):
-    """Return whether blocks overturn, and their peak rotation over their slenderness: any number, by one program."""
+    """Return whether blocks overturn, and peak rotations over slenderness: any number of scenes by one program."""
     arrays = np.broadcast_arrays(*scenes)
     count = arrays[0].size
     lists = [np.resize(x, (-(-count // 64), 64)) for x in arrays]
@@ -51,7 +51,7 @@ def outcomes(*scenes):
 
 @functools.cache
 def verdicts():
-    """What blocks do, each drawn for its test."""
+    """Draw the verdicts of blocks, each with a block of its own."""
     return outcomes(ALPHA * np.exp(SCATTER * np.random.default_rng(5).normal(size=COUNT)), *PULSES.T)
 
 

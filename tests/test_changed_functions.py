@@ -1,4 +1,4 @@
-"""Functions of a user's that change behind the package's back: every call sees them as they are then."""
+"""User functions that change after they were passed: every call uses them as they are then."""
 
 import functools
 
@@ -242,7 +242,7 @@ def fresh(name):
     *(pytest.param(name, way, id=f"{name}-{way.__name__}", marks=pytest.mark.slow) for name in SLOW for way in FEW),
 ])  # fmt: skip
 def test_a_changed_function_gives_a_changed_answer(name, way):
-    """Every way through the first entries; all entries ask the same function, `current_function`."""
+    """Check all ways of changing a function for the first entry points; all entries use `current_function`."""
     entry, use = (QUICK | SLOW)[name]
     expected = fresh(name)
     function, change = way(use)
@@ -261,7 +261,7 @@ NUMBER = jax.ShapeDtypeStruct((), np.dtype(float))
 
 @pytest.mark.parametrize("way", WAYS, ids=lambda way: way.__name__)
 def test_programs_are_equal_and_arrays_are_not(way):
-    """Of any two sizes, so that nothing is compiled again."""
+    """Check for any two sizes that programs are equal and arrays are not, so that nothing is compiled again."""
     function, change = way(lambda size, x: jnp.sum(jnp.asarray(size)) * jnp.cos(x))
     before, same = (current_function(function, NUMBER) for _ in range(2))
     after = current_function(change() or function, NUMBER)

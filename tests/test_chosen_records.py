@@ -36,7 +36,7 @@ def outcome(motion, scale=1.0):
 
 
 def at_scales(motion, scales):
-    """Of one motion with samples of its own."""
+    """Outcomes at several scales, of one motion with samples of its own."""
     return jax.vmap(lambda scale: outcome(motion, scale))(scales)
 
 
@@ -48,7 +48,7 @@ def grid():
 
 @pytest.fixture(scope="module")
 def by_hand():
-    """The same, record after record with samples of its own."""
+    """Outcomes of the records one after the other, each with samples of its own."""
     return jax.tree.map(lambda *rows: np.stack(rows), *(at_scales(motion, SCALES) for motion in RECORDS))
 
 
@@ -61,8 +61,11 @@ def test_an_axis_of_records_beside_one_after_the_other(grid, by_hand, name):
 
 @functools.partial(jax.jit, static_argnums=1)
 def told(motion, in_place):
-    """Of twice a motion: its first piece and the one after its last, bounds of what is to come, lengths of pieces, the
-    strongest drive, and bounds of the pieces."""
+    """Return facts of the scene under twice a motion, by which records in place and alone are compared.
+
+    These are its first piece, the piece after its last, bounds of later forcing, lengths of pieces, the strongest
+    drive, and bounds of the pieces.
+    """
     scene = Scene.of(BLOCK, 2.0 * motion, rk.Linear(), in_place=in_place)
     ahead, count = scene.outlook.horizontal, sum(LENGTHS) if in_place else motion.samples.size
     lengths = jax.vmap(scene.length)(jnp.arange(count))
@@ -122,7 +125,7 @@ def test_lanes_share_the_samples_of_all_records():
 
 
 def test_what_is_known_stays_so():
-    """Else every call would put all records together again, and every suite be a program of its own."""
+    """Check that known records stay concrete: else every call would join them again, and every suite compile anew."""
     found = []
     jax.jit(lambda number: found.append(joined()[number].joined) or number)(1)
     assert not is_traced(found)

@@ -167,7 +167,7 @@ def test_single_lobe_in_220_digits(i):
 
 @functools.cache
 def of_pulses(name):
-    """Of every lobe: times of uplift at three strengths, or a wall."""
+    """Return, for every lobe, times of uplift at three strengths, or a wall."""
     if name == "uplift_time":
         return each(single_lobe.uplift_time, [0.03, 0.5, 0.97], SHAPES[:, None])
     return each(getattr(single_lobe, name), DURATIONS, SHAPES)
@@ -236,7 +236,7 @@ def test_single_lobe_limits(duration):
     """Rectangle, triangle, spike; V 3.9, 3.10 corrected, 3.13, 3.14, and the border between S1 and S2."""
     approx = functools.partial(pytest.approx, rel=1e-12)
     f, half = duration, duration / 2
-    # Of rectangle, triangle, spike.
+    # Shapes: rectangle, triangle, spike.
     wall, falling, rising = (
         each(function, f, [-np.inf, 0.0, np.inf])
         for function in (single_lobe.safety_wall, single_lobe.falling_wall, single_lobe.rising_wall)
@@ -283,7 +283,7 @@ def test_single_lobe_inverses():
 
 
 def test_long_critical_durations():
-    """Of blocks that hardly uplift: log 2 times the slope at the peak, over what the strength is below 1."""
+    """Compare critical durations of blocks that hardly uplift with log 2 times the peak's slope over 1 - strength."""
     missing, shape = np.array([3e-2, 5e-4, 1e-8])[:, None], np.array([-5.0, -0.5, 0.0, 2, 40, 1e5])
     duration = each(single_lobe.critical_duration, 1 - missing, shape)
     np.testing.assert_allclose(each(single_lobe.safety_wall, duration, shape), 1 - missing + 0 * shape, rtol=1e-14)
@@ -359,12 +359,12 @@ def test_histories_agree_with_the_single_lobe():
 
 @functools.cache
 def intervals(ratio, e):
-    """From fewer samples than usual, which take longer than all else here."""
+    """Return intervals by fewer samples than usual; the sampling takes longer than all else here."""
     return sine_pulse.overturning_intervals(ratio, e, points=128)
 
 
 def test_limits_during_the_pulse_are_ends_of_intervals(references):
-    """Of those in 200 bits; six have none."""
+    """Check that limits during the pulse are ends of intervals; six of those in 200 bits have no limit."""
     cases = references["linear_sine_intervals"]
     ratio, e = (np.array([float(case[name]) for case in cases]) for name in ("frequency_ratio", "restitution"))
     limits = np.asarray(sine_pulse.during_pulse_limit(ratio, e))
@@ -416,7 +416,7 @@ def test_engine_finds_every_interval(ratio, e):
 
 
 def test_islands():
-    """What the paper's four curves miss: overturning after 3, 5, 7... impacts at low frequency."""
+    """Find islands that the paper's four curves miss: overturning after 3, 5, 7... impacts at low frequency."""
     np.testing.assert_array_equal(intervals(0.5, 0.8).impacts, [5, 3, 1, 0])
     np.testing.assert_array_equal(intervals(3.0, 0.9).impacts, [1, 0])
 
@@ -567,7 +567,7 @@ def test_pushover_has_ranges():
 
 
 def test_no_impact_costs_nothing():
-    """Of a block that an impact would stop as well: and the amplitude does not depend on the restitution."""
+    """Check the amplitude without impacts: it does not depend on the restitution, even at a restitution of zero."""
     value, slope = jax.value_and_grad(lambda e: pushover.amplitude_after(0, 0.5, e))(0.0)
     assert (float(value), float(slope)) == (pytest.approx(0.5, rel=1e-15), 0.0)
 
@@ -597,7 +597,7 @@ def test_free_rocking():
 
 @jax.jit
 def slopes_by_time(*values):
-    """Of rotation and velocity under a single lobe."""
+    """Return derivatives by time of rotation and velocity under a single lobe."""
     return [jax.grad(function)(*values) for function in (single_lobe.rotation, single_lobe.velocity)]
 
 

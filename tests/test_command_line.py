@@ -187,7 +187,7 @@ def test_impacts_of_a_history_that_is_shorter(command, at2, tmp_path, undrawn):
 
 
 class Unwritable(io.StringIO):
-    """What is written to it fails."""
+    """A stream that raises on every write."""
 
     def __init__(self, error):
         super().__init__()
@@ -242,7 +242,7 @@ def test_run_that_cannot_be_completed(command, at2):
 
 
 def test_fragility(command, column, tmp_path):
-    """Of two records; the table is that of the library."""
+    """Compare the fragility of two records with the library's table."""
     other = tmp_path / "other.csv"
     other.write_text("acceleration\n" + "".join(f"{float(a) * 980.665!r}\n" for a in SAMPLES[::-1]))
     words = ["--unit", "cm/s2", "--dt", "0.02", "--levels", "0.2", "6", "--points", "10", "--model", "linear"]
@@ -270,7 +270,7 @@ def test_fragility(command, column, tmp_path):
 
 
 def test_errors_of_one_record_are_not_known():
-    """It says nothing of others, whatever its blocks did."""
+    """Check that errors are unknown from one record: it says nothing of others, whatever its blocks did."""
     levels = jnp.geomspace(0.2, 6.0, 10)
     verdict = (np.arange(10)[:, None] > np.array([2, 5, 8])).astype(np.int8)[None]
     found = rk.hazard.SimulatedFragility(levels, verdict, *jnp.ones((2, 1)), ("a",), "PGA")
@@ -289,7 +289,7 @@ def test_patterns_that_no_shell_has_expanded(tmp_path):
 
 
 def test_spectral_velocities_are_not_written_for_openquake(tmp_path, monkeypatch, capsys):
-    """Which knows none: the command says so, and has all other files."""
+    """Check that the command refuses spectral velocities, which OpenQuake does not know, and writes all other files."""
     monkeypatch.setattr(rk.plot, "fragility", lambda *_: types.SimpleNamespace(figure=plt.figure()))
     found = rk.hazard.SimulatedFragility(
         jnp.array([0.1, 0.2]), np.zeros((1, 2, 1), np.int8), *jnp.ones((2, 1)), ("a",), "SV(0.5)", np.ones(1)
@@ -399,7 +399,7 @@ def test_map_of_a_pulse_with_more_parameters(command, tmp_path):
 
 
 def test_map_of_a_lobe(command, tmp_path):
-    """Over pulse duration and uplift strength: overturned below the wall of the closed form, safe above."""
+    """Check a map over pulse duration and uplift strength: overturned below the closed form's wall, safe above."""
     words = ["--uplift-strength", "0.1", "0.9", "--pulse-duration", "0.5", "6", "--model", "linear"]
     status, _, errors = command("map", "--points", "7", "--pulse", "exponential", "--shape", "0.5", *words)
     assert status == 0 and errors == ""
@@ -415,7 +415,7 @@ def test_map_of_a_lobe(command, tmp_path):
 
 @pytest.mark.parametrize("pulse", PULSES)
 def test_every_pulse_has_its_words(pulse):
-    """Of every pulse the command makes one with what the words do not say: defaults, or a shape of 0."""
+    """Check that every pulse is made from words; settings without words take their defaults, or a shape of 0."""
     parser = argparse.ArgumentParser()
     add_pulse(parser)
     motion = pulse_of(parser.parse_args(["--pulse", pulse]))(0.5, 1.0)
@@ -577,7 +577,7 @@ def test_bad_input(tmp_path, monkeypatch, capsys, words, error):
     ],
 )
 def test_bad_words(capsys, words, error):
-    """What argparse refuses: usage, then one line."""
+    """Check words that argparse refuses: usage, then one line."""
     with pytest.raises(SystemExit) as stopped:
         main(words)
     assert stopped.value.code == 2
@@ -611,7 +611,7 @@ def test_what_failed_is_told_to_programs(capsys, at2, tmp_path, undrawn):
 
 
 def test_quiet(capsys, at2, tmp_path):
-    """Only what went wrong is said."""
+    """Check that `--quiet` prints errors only."""
     out = ["--quiet", "--out", str(tmp_path / "out")]
     assert main(["run", at2, *GIVEN, *out]) == 0
     assert capsys.readouterr() == ("", "") and is_figure(tmp_path / "out" / "history.png")
@@ -697,7 +697,7 @@ def test_nothing_is_kept_where_that_is_off(capsys):
 
 @pytest.mark.parametrize(("raised", "status"), [(KeyboardInterrupt, 130), (BrokenPipeError, 141)])
 def test_what_ends_a_command_from_outside_is_no_bad_input(monkeypatch, capfd, raised, status):
-    """Interrupted, or read by nobody any more: no traceback, and a status of its own."""
+    """Check an interrupt and a closed pipe: no traceback, and an exit status of its own."""
 
     def ended(words):
         raise raised

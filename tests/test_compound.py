@@ -1,5 +1,7 @@
-"""Operations that consist of many: what they give, how they change, what is written for them, and of which types; how
-long programs are."""
+"""Compound operations: their values, derivatives, programs and types.
+
+The tests also bound the length of programs.
+"""
 
 import collections
 import math
@@ -62,7 +64,7 @@ def written_of(operation, settings, numbers):
 
 @each
 def test_it_is_what_it_consists_of(operation, settings, count):
-    """Alone, compiled, and at many places of which some numbers are shared; one operation in a program."""
+    """Check that an operation equals its expansion: alone, compiled, and in a batch with shared numbers."""
     numbers, shares = numbers_for(count), np.linspace(0.9, 1.1, 3)
     written = jaxpr_as_fun(written_of(operation, settings, numbers))
 
@@ -93,7 +95,7 @@ def test_it_is_what_it_consists_of(operation, settings, count):
 
 @each
 def test_it_changes_as_what_it_consists_of(operation, settings, count):
-    """Forward, reverse, by some of the numbers, and again."""
+    """Check that derivatives equal those of the expansion: forward, reverse, by some of the numbers, and again."""
     numbers = numbers_for(count)
     program = written_of(operation, settings, numbers)
 
@@ -186,7 +188,7 @@ def test_a_choice_is_that_of_numpy():
 
 
 def test_what_is_fixed_has_no_derivatives():
-    """All of it is one operation."""
+    """Check that a `fixed` value has no derivatives; all of it is one operation."""
 
     def of(x, y):
         held = fixed({"a": x, "b": (y, jnp.int32(2))})
@@ -282,7 +284,7 @@ def test_powers(count):
 
 
 def operations_of(jaxpr):
-    """Names of those in a program, each as often as it stands there."""
+    """Return the names of the operations in a program, with repetition."""
     inner = [
         getattr(part, "jaxpr", part)
         for equation in jaxpr.eqns

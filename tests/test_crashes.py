@@ -1,4 +1,4 @@
-"""What is promised when something breaks (docs/crashes.md): what is lost is named, and nothing wrong is returned."""
+"""Promises when a run breaks (docs/crashes.md): losses are named, and no wrong result is returned."""
 
 import concurrent.futures
 import errno
@@ -103,7 +103,10 @@ DAMAGE = [(how, file) for how in (flip, cut, empty, vanish) for file in BLOCKS +
 
 @pytest.mark.parametrize("how, file", DAMAGE + [(from_elsewhere, file) for file in MOVED])
 def test_what_is_damaged_is_named_and_computed_again(store, right, file, how):
-    """A plain load refuses it. The name is that of the file; of an axis it is that of its folder."""
+    """Check that damaged files are named and computed again.
+
+    A plain load refuses them. The name is that of the file; of an axis it is that of its folder.
+    """
     how(store / file)
     named = str(store / file.removesuffix("/c/0"))
     if how is vanish and file in RECORDS:  # as if it had never been computed
@@ -157,7 +160,7 @@ def test_what_was_not_computed_is_no_result_to_other_readers_either(store):
 
 
 def test_blocks_without_any_number_are_told_from_none(tmp_path):
-    """What is not a number, of any sign, is a result as any other."""
+    """Check blocks of NaN only, of either sign: NaN is a result like any other."""
     grids = [
         rk.sweep(lambda x: -jnp.nan * x, store=tmp_path / "a.zarr", block=2, progress=False, x=[1.0, 2.0, 3.0])
         for _ in range(2)
@@ -328,7 +331,7 @@ def test_a_store_that_cannot_be_made_leaves_nothing(tmp_path, small_disk):
 
 
 def interrupted(function, after):
-    """Return whether Ctrl-C came before the function was done, so many seconds after it began."""
+    """Return whether Ctrl-C arrived before the function finished, this many seconds after its start."""
 
     def strike(*_):
         raise KeyboardInterrupt
@@ -418,7 +421,7 @@ def test_many_make_one_store_together(tmp_path, right):
 
 
 def test_somebody_else_saved_meanwhile(tmp_path, monkeypatch, grid):
-    """Theirs stays."""
+    """Check that a file that another process saved meanwhile stays."""
     write = netcdf._Patient._write
 
     def slow(self, at, data):
@@ -555,7 +558,7 @@ def test_what_a_format_does_not_take_is_refused(tmp_path, ending, bad):
 
 
 def test_a_description_is_told_from_one_that_was_changed(store):
-    """Whoever changes it by hand."""
+    """Check that a description edited by hand is detected."""
     text = json.loads((store / "zarr.json").read_text())
     text["attributes"]["jaxrock_store"] = text["attributes"]["jaxrock_store"].replace('"block": [2', '"block": [3')
     (store / "zarr.json").write_text(json.dumps(text))

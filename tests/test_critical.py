@@ -187,7 +187,7 @@ def test_traced_arguments_need_a_number_of_ends():
 @pytest.mark.slow
 @pytest.mark.parametrize("known", [True, False])
 def test_lowest_ends_are_those_of_all(known):
-    """Of known and of traced arguments, with the same derivatives; of one block, of many, and of durations."""
+    """Compare the lowest ends of concrete and traced arguments, with derivatives: one block, many, and durations."""
     block, pulse = rk.Block(0.1, 2.0, 0.9), rk.SinePulse(0.3, np.array([1.5, 2.5]))
     cases = [
         (rk.critical_amplitudes, rk.Block(0.2, 2.0, 0.9), rk.SinePulse(1.0, 0.8), rk.Housner()),
@@ -285,7 +285,7 @@ def test_durations_are_refused_of_models_that_know_p():
 
 
 def test_the_amplitude_of_what_is_made_of_a_pulse_is_its_peak():
-    """Of Mavroeidis and Papageorgiou's pulse the bound that it tells lies a tenth above."""
+    """Check that the amplitude of a scaled Mavroeidis-Papageorgiou pulse is its peak, a tenth below its bound."""
     block, motion = rk.Block(0.2, 2.0), 1.0 * rk.MavroeidisPapageorgiouPulse(0.3, 1.0)
     found = rk.critical_amplitudes(block, motion, **QUICK, max_ends=1, derivatives=False, progress=False)
     factor = float(found.value[0] / rk.intensity.peak_acceleration(motion))

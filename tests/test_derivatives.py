@@ -119,7 +119,7 @@ WEIGHTS = dict(zip(SEEN, np.eye(len(SEEN))))  # of one of them
 
 
 def whole(kind, x, start=(0.0, 0.0)):
-    """What is seen of a block under a record and more, all of which moves but the start."""
+    """Return results of a block under a record in one of several settings, as a function of all other numbers."""
     samples, dt, numbers = x
     block, motion = rk.Block(*numbers[:3]), rk.Record(samples, dt)
     model = rk.Linear() if kind == "linear" else rk.Housner()
@@ -137,9 +137,10 @@ def whole(kind, x, start=(0.0, 0.0)):
 
 @functools.cache
 def by_all(kind):
-    """What is seen of `x`, a start and weights, and slopes by all of `x` of what is seen as it is weighed, in reverse.
+    """Return the outcome at `x`, a start and weights, and its weighted gradient by all of `x`, in reverse mode.
 
-    Compiled once for a length."""
+    Compiled once for a length.
+    """
 
     @jax.jit
     def pulled(x, start, weights):
@@ -603,7 +604,7 @@ TIME = np.arange(0, 60, 0.02)  # of records that share what is compiled
 
 @functools.cache
 def without_motion():
-    """Sensitivities of a linear block under a ground that stays where it is."""
+    """Return sensitivities of a linear block under a ground that does not move."""
     return rk.studies.sensitivity(rk.Block(0.2, 2.0), rk.Record(0.0 * TIME, 0.02), rk.Linear())
 
 
@@ -766,8 +767,10 @@ def test_distances_tell_how_far_is_too_far():
 
 @pytest.mark.parametrize("case", USES)
 def test_whether_a_slope_can_be_followed(case):
-    """Steps along the steepest way: a thousandth of the reach does what the slopes say, within a hundredth of it; and
-    where they are useless, steps of 1e-6 do something else altogether."""
+    """Check the reach: steps of a thousandth of it, in the steepest direction, follow the slopes to a hundredth.
+
+    Where slopes are useless, steps of 1e-6 do something else altogether.
+    """
     block, motion, status = USES[case]
     found = rk.studies.sensitivity(block, motion, rk.Linear())
     assert found.outcome.status == rk.Status.successful and not bool(found.outcome.overturned)

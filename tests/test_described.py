@@ -1,4 +1,4 @@
-"""What one sees of blocks, motions and results when they are printed."""
+"""Printed form of blocks, motions and results."""
 
 import re
 
@@ -88,7 +88,7 @@ def test_nothing_public_that_holds_numbers_shows_their_shapes_alone():
 
 
 def test_results_without_values_can_be_seen():
-    """What `jax.eval_shape` and `eqx.filter` leave of them."""
+    """Check that results without values, as `jax.eval_shape` and `eqx.filter` leave them, can be printed."""
     block, motion = rk.Block(0.3, 1.6), rk.SinePulse(0.5, 0.9)
     shapes = jax.eval_shape(lambda: rk.outcome(block, motion))
     assert "status=Status[]" in repr(shapes)

@@ -20,7 +20,7 @@ import jaxrock as rk
 
 PATIENCE = 240  # seconds; all of it takes some ten
 
-# What is swept over which axes; before it jaxrock is `rk`.
+# Sweeps: a function and its axes, as text in which jaxrock is `rk`.
 SWEEPS = """
 import jax, jax.numpy as jnp, numpy as np
 
@@ -146,7 +146,7 @@ DAMAGED = (0, 1, 4)  # blocks
 
 @pytest.fixture(scope="module")
 def alone():
-    """What one process finds, this one."""
+    """Return the result that one process finds, this one."""
     given = {"rk": rk}
     exec(SWEEPS, given)
     grid = rk.sweep(given["chaotic"], block=100, progress=False, **given["axes"])

@@ -1,4 +1,4 @@
-"""What the documentation says runs, and its links lead somewhere."""
+"""Code in the documentation runs, and its links lead somewhere."""
 
 import ast
 import importlib
@@ -111,7 +111,7 @@ def shown(space):
 
 
 def public_things():
-    """Everything public that is no module, and all names under which users find it."""
+    """Return every public object that is no module, and all names under which users find it."""
     found = {}
     for path, space in namespaces().items():
         for name, value in shown(space):
@@ -134,7 +134,7 @@ def test_completion_shows_what_is_public_and_no_more():
     assert "law_of" in vars(rk.restitution) and "law_of" not in dir(rk.restitution)
 
 
-# Whose functions the table of names does not tell one by one.
+# Modules whose functions the table of names does not list one by one.
 WHOLE = {"closed_form", "intensity", "processing", "similarity"}
 
 
@@ -196,7 +196,7 @@ def test_every_part_of_the_examples_runs_by_itself_and_gives_the_types_it_says(h
 
 
 def named_in(code):
-    """What of the package is written in a program, also by a short name of a namespace."""
+    """Return the names of the package in some code, also by a short name of a namespace."""
     tree, known = ast.parse(code), {"rk": rk}
 
     def value(node):

@@ -196,8 +196,7 @@ def test_a_film_follows_the_response(response):
 
 
 def knots_drawn(axis):
-    """Return whether the end of `PULSE`, and the moment before it, are among the times of a curve, whose steps miss
-    them."""
+    """Return whether the times of a curve include the end of `PULSE` and the moment before it, which its steps miss."""
     time = axis.lines[0].get_xdata()
     return np.isin([np.nextafter(1.0, 0.0), 1.0], time).all() and np.all(np.diff(time) >= 0)
 
@@ -327,7 +326,7 @@ def test_a_film_that_fails_leaves_the_one_before(kind, response, tmp_path, monke
 
 
 def test_films_as_html_are_whole_and_of_their_dpi(response, tmp_path):
-    """Of another dpi a film is drawn anew; one beyond matplotlib's limit keeps its end."""
+    """Check that HTML films are complete: another dpi draws anew, and beyond matplotlib's limit the end is kept."""
     film, sizes = rk.plot.animate(response, fps=2, speed=30.0), []
     scene_alone(film)
     for dpi in (20, 40):
@@ -413,7 +412,7 @@ EDGES = {
 @pytest.mark.parametrize("rotation", [0.2, -0.2, 0.6])
 @pytest.mark.parametrize("name", EDGES)
 def test_a_rounded_edge_rolls_on_the_ground(name, rotation):
-    """Nothing of it is below the ground, it touches, and its centre is where the equation of motion has it."""
+    """Check a rounded edge on the ground: it touches without going below, with the centre of the equation of motion."""
     block, model = EDGES[name]
     body = Body.of(block, model)
     shapes = body.pose(rotation)

@@ -76,7 +76,7 @@ def scaled(kind, rows, factor):
 
 
 def nonsense(found):
-    """What no outcome may be, whatever became of the scene: numbers that are none beside status successful."""
+    """Return lanes with status successful whose numbers no outcome may have, such as NaN."""
     good, lost = found["successful"], found["overturned"]
     finite = np.isfinite(found["margin"])
     for name in ("max_rotation", "max_velocity", "time_of_max", "error"):
@@ -315,7 +315,7 @@ def test_less_is_computed_where_less_is_asked():
 
 
 class Count(eqx.Module):
-    """As much of a state as a loop over steps asks for."""
+    """A state with the fields that a loop over steps reads."""
 
     steps: jax.Array
     last: jax.Array

@@ -98,7 +98,7 @@ def test_critical():
 
 
 def test_broken_curves():
-    """What stands alone between gaps, or at an end, is a dot."""
+    """Check that a single point between gaps, or at an end, is drawn as a dot."""
     _, axis = plt.subplots()
     values = [1.0, np.inf, 2.0, 3.0, np.nan, 4.0, np.inf, 5.0]
     line = rk.plot.broken_curve(axis, np.arange(8), values, color="red")
@@ -320,7 +320,7 @@ def test_a_map_of_one_row_or_column_is_drawn():
 
 @pytest.mark.filterwarnings("error")
 def test_places_that_are_there_twice_have_one_cell():
-    """Of two alike neither would have a width, and all would be the colour of the safe."""
+    """Check that equal places share one cell: two cells would have no width, and all would have the colour of safe."""
     result = rk.overturning_map([2.0, 2.0], [4.0, 3.0, 4.0], **LINEAR)
     axis = rk.plot.overturning(result, exact=False)
     drawn = axis.collections[-1]

@@ -115,7 +115,7 @@ def test_what_is_linear_stays_so(base, damping):
 
 @pytest.mark.slow
 def test_small_rotations_are_a_limit():
-    """Of columns ever more slender, their pulses and stiffness in proportion: what is left goes as alpha^2."""
+    """Check columns ever more slender, with pulses and stiffness in proportion: the difference falls as alpha^2."""
     off = []
     for alpha in (0.04, 0.02):
         shape = dict(width=50 * alpha, height=50.0, youngs_modulus=30e9 * (0.1 / alpha) ** 2, density=2500.0)
@@ -197,7 +197,7 @@ def test_the_margin_is_zero_where_a_column_balances(by_amplitude):
 
 @pytest.mark.slow
 def test_derivatives_and_differences(by_amplitude):
-    """Of the peak by the amplitude, forward; by modulus and damping, reverse."""
+    """Compare derivatives with differences: of the peak by the amplitude, forward; by modulus and damping, reverse."""
     at, step = 0.5, 1e-5
     (peak, _), (slope, _), _ = by_amplitude(np.array([at - step, at, at + step]))
     assert float(slope[1]) == pytest.approx(float(peak[2] - peak[0]) / (2 * step), rel=1e-6)

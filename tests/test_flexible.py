@@ -130,7 +130,7 @@ def test_what_no_constructor_has_seen_has_a_status():
 
 
 def test_what_a_constructor_refuses_is_not_possible():
-    """A column that is stiffer than its base, and bends under its own weight; a law."""
+    """Check that `is_possible` refuses what constructors refuse: a column bent by its weight, a ratio above 1."""
     block = rk.blocks.FlexibleBlock(0.5, 3.0, 3e9, 2000.0, 0.02, masses=3, p_delta=True, restitution=0.9)
     possible = jax.jit(is_possible)
     assert possible(block)
@@ -420,7 +420,7 @@ def test_the_margin_is_zero_where_a_column_balances(by_amplitude):
 
 @pytest.mark.slow
 def test_derivatives_and_finite_differences():
-    """By modulus, density, damping and size: forward mode against central differences of the values."""
+    """Compare forward-mode derivatives by modulus, density, damping and size with central differences of the values."""
 
     def peaks(x):
         block = rk.blocks.FlexibleBlock(x[3], x[4], 1e9 * x[0], 1e3 * x[1], x[2])
@@ -437,7 +437,7 @@ def test_derivatives_and_finite_differences():
 
 @pytest.mark.slow
 def test_derivatives_and_an_independent_integration():
-    """The same against central differences of SciPy's peaks, after an impact; compiled and not, the value is one."""
+    """Compare derivatives with differences of SciPy's peaks, after an impact; compiled and uncompiled values agree."""
     optimize = pytest.importorskip("scipy.optimize")
 
     def block(x):

@@ -69,7 +69,7 @@ def test_beside_the_closed_form(space):
 
 
 def test_what_scaling_takes():
-    """The record times a factor has the integral that topples."""
+    """Check scaling: the record times the factor has the integral that topples."""
     factor = ALPHA / (push() @ np.asarray(START.samples))
     np.testing.assert_allclose(found(starts=3, baseline=False).scaling, (factor - 1) * size(START.samples), rtol=1e-6)
 

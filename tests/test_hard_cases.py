@@ -250,8 +250,10 @@ def test_elastic_impacts_never_end():
 
 @functools.partial(jax.jit, static_argnums=0)
 def _used_up(steps):
-    """A history without loss that ends with its steps: as a whole, its last impact, three times, its states then, and
-    the forces of the ground."""
+    """Return a history without loss that runs out of steps.
+
+    As a whole, its last impact, three times, its states then, and the forces of the ground.
+    """
     block, still = rk.Block(0.2, 2.0, 1.0), rk.RectangularPulse(0.0, 1.0)
     engine = rk.Series(max_steps=steps)
     cut = rk.simulate(block, still, rk.Linear(), initial=(0.1, 0.0), duration=100.0, engine=engine)
@@ -476,8 +478,10 @@ def test_extreme_blocks(ratio, alpha):
 @pytest.mark.parametrize("order", [None, 20])
 @pytest.mark.parametrize("many", [False, True], ids=["one", "many"])
 def test_a_long_wait_in_single_precision(order, many):
-    """Of a slow sine the last coefficients vanish, and powers of the time until it lifts the block overflow: their
-    product is no number. From order 19 on the block was said never to move."""
+    """Check a slow sine in single precision: its last coefficients vanish, and powers of the time to uplift overflow.
+
+    The product of the two would be NaN; from order 19 on, the block would be reported as never moving.
+    """
     scene = jax.tree.map(jnp.float32, (rk.Block(0.2, 1.0, 0.9), rk.SinePulse(0.3, 2 * np.pi / 0.05)))
 
     def one(scene):
@@ -516,8 +520,10 @@ def _verdict(samples, dt, duration):
 
 @pytest.mark.parametrize("dt", [0.005, 0.01, 0.02])
 def test_a_history_as_long_as_its_record_tells_the_verdict(dt):
-    """The last step of such records is longer than what is left of the duration, by a rounding: the free stage was left
-    out, and a block that is thrown down was safe."""
+    """Check that a history as long as its record tells the verdict, although the last step is a rounding longer.
+
+    Without the free stage a block that is thrown down would be reported safe.
+    """
     constant = np.full(10, 3.0)
     end = float(rk.Record(constant, dt).end)
     for duration in (dt * (constant.size - 1), end, np.nextafter(end, 1.0), np.nextafter(end, 0.0)):
@@ -542,7 +548,7 @@ def history_in(precision, *numbers):
 @pytest.mark.filterwarnings("ignore:jaxrock runs in single precision")
 @pytest.mark.parametrize("precision", [np.float32, np.float64])
 def test_what_comes_to_rest_does_not_fall_through_the_ground(precision):
-    """In single precision the hops that are left out of a history last for 20 ms."""
+    """Check rest in single precision, where the hops that a history leaves out last for 20 ms."""
     response = history_in(precision, 0.23036395, 3.820548, 0.92390084, 0.24509491, 0.26094967, 0.4)
     assert np.abs(response["rotation"]).max() <= response["max_rotation"] * (1 + 1e-5)
     assert np.abs(response["velocity"]).max() <= response["max_velocity"] * (1 + 1e-5)
@@ -570,8 +576,10 @@ def tables():
 
 @pytest.mark.parametrize("engine, model, kind", tables())
 def test_table(engine, model, kind):
-    """Every case is answered within its bound, with an honest error; refused, or answered with an error that tells
-    enough, only where the table allows it."""
+    """Check that every case is answered within its bound, with an honest error.
+
+    It may be refused, or answered with a large but sufficient error, only where the table allows it.
+    """
     cases = [case for case in hard_cases.CASES if case.kind == kind and model in case.models]
     cases = [case for case in cases if case.single or engine != "single"]
     known = [hard_cases.answers()[hard_cases.key(case, model)] for case in cases]
@@ -603,7 +611,7 @@ def test_the_table_has_answers():
 
 
 def test_the_judge_sees_errors():
-    """What is wrong by more than the bound is found, in each number."""
+    """Check that the judge finds an error beyond the bound in each number."""
     known = hard_cases.answers()["several excursions (nonlinear)"]
     good = {"max_rotation": np.float64(known["peak"]), "impact_count": known["impacts"], "overturned": False}
     good |= {"margin": 0.5, "error": 1e-15}
@@ -625,7 +633,7 @@ def test_the_judge_sees_errors():
 @pytest.mark.filterwarnings("ignore:jaxrock runs in single precision")
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])
 def test_the_error_of_a_small_peak(dtype):
-    """Blocks that hardly move when the motion ends: the peak comes by energy, the history's step by step."""
+    """Check the small peaks of blocks that hardly move when the motion ends: by energy, and by steps in the history."""
     rates, pulse = np.geomspace(1e-3, 2.0, 4), (0.3, 0.25)
     scenes = [((0.2, p, 0.5), pulse, (0.0, 0.0)) for p in rates]
     found = hard_cases.outcomes("sine", "nonlinear", EXACT, scenes, dtype)

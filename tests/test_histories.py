@@ -177,7 +177,7 @@ def test_what_a_history_does_not_show_has_no_interval(rotation, untold):
 
 def test_a_start_without_a_result_is_given_up():
     def at(point, samples):
-        """A line through the origin, that cannot be drawn with a slope below 1.9 (one of the starts)."""
+        """A line through the origin that cannot be evaluated with a slope below 1.9 (one of the starts)."""
         slope = np.arange(1.0, 10.0)
         return np.where(point < 1.9, np.inf, (point - 3) * slope), slope[:, None]
 
@@ -195,7 +195,7 @@ def test_a_start_without_a_result_is_given_up():
 
 @pytest.mark.parametrize("kept", [0.0, 0.6, 0.9])
 def test_robust_variance_of_a_mean(kept):
-    """Of n errors that keep a share of the one before: (1 + kept)/(1 - kept)/n, but for what few errors hide."""
+    """Compare the variance of a mean of n correlated errors with (1 + kept)/(1 - kept)/n, up to the bias of few."""
     size, found = 2000, []
     for seed in range(60):
         residuals = noise(seed, size, kept)

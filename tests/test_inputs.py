@@ -458,7 +458,7 @@ def test_results_of_checked_values_stay_where_they_are():
 
 
 def test_checks_where_xla_has_no_function_for_them(monkeypatch):
-    """They call back."""
+    """Check that argument checks call back to Python where XLA has no function for them."""
     text = jax.jit(area).lower(0.2).as_text()
     assert CHECK in text and "callback" not in text
     monkeypatch.setattr(_guard, "has_check", lambda: False)
@@ -471,7 +471,7 @@ def test_checks_where_xla_has_no_function_for_them(monkeypatch):
 
 @pytest.mark.parametrize("failed", [False, True])
 def test_what_failed_is_marked_where_no_error_can_be_made(failed):
-    """As XLA calls it, which answers nothing when it is asked for an error."""
+    """Check that a failure is marked in the results if XLA returns no error when asked to make one."""
     flags = np.array([failed, not failed])
     buffers = [_foreign.Buffer(data=flags[i:].ctypes.data) for i in range(2)]
     tables = [(ctypes.c_void_p * 1)(ctypes.addressof(each)) for each in buffers]

@@ -105,7 +105,7 @@ FIRST_LINES = {
 
 @pytest.mark.parametrize("name", FIRST_LINES)
 def test_peak_displacement_where_a_line_begins_at_rest(name):
-    """Cubics between a hundred thousand times of each record are the judge: they are exact for lines."""
+    """Check the peak displacement of lines that begin at rest against cubics, exact for lines, at 100,000 times."""
     samples, dt = FIRST_LINES[name]
     time = np.linspace(0.0, dt * (len(samples) - 1), 100_001)
     velocity = cumulative_trapezoid(G * np.interp(time, dt * np.arange(len(samples)), samples), time, initial=0)
@@ -329,7 +329,10 @@ def test_one_motion_has_one_mean_period():
 
 
 def test_mean_period_of_few_samples_a_second():
-    """Straight lines between samples move above half of the rate of the samples, too: as those at a shorter step do."""
+    """Compare the mean period of a record with few samples a second with that at a shorter step.
+
+    Straight lines between samples have content above half of the sampling rate, too.
+    """
     signs = np.where(np.arange(400) % 2, 0.1, -0.1)
     record = rk.Record((np.sin(2 * np.pi * np.arange(400) * 0.05) + signs) * (np.arange(400) % 399 > 0), 0.05)
     finer = rk.Record(np.interp(0.0125 * np.arange(1597), 0.05 * np.arange(400), record.samples), 0.0125)
@@ -430,7 +433,7 @@ def test_a_pulse_among_many_pieces(case):
 
 
 def test_sums_over_a_pulse_beside_a_record():
-    """Of what does not overlap they add up."""
+    """Check that sums add up over a pulse and a record that do not overlap."""
     pulse, record = rk.SinePulse(0.6, 1.0), rk.example_record()
     both = pulse + record.shifted(5.0)
     for measure in (rk.intensity.arias, rk.intensity.cumulative_absolute_velocity):

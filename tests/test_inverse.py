@@ -1,4 +1,4 @@
-"""What rocks say about a motion: probabilities against counted verdicts, maxima against grids, honest refusals."""
+"""Inference on a motion from rocks: probabilities against counted verdicts, maxima against grids, honest refusals."""
 
 import re
 import sys
@@ -39,7 +39,7 @@ def rocked(amplitude, period, alpha, p, restitution):
 
 
 def what_becomes(**scenes):
-    """Verdict and peak rotation of scenes given by lists that go together: no likelihood, no margin."""
+    """Return verdicts and peak rotations of scenes given by parallel lists, without a likelihood or margin."""
     arrays = np.broadcast_arrays(*scenes.values())
     count = arrays[0].size
     # As many as of the largest test, over and over: one compiled program.
@@ -133,7 +133,7 @@ def test_a_likelihood_is_smooth_in_the_amplitude():
 
 
 def log_terms(seen, scatter=SCATTER, **values):
-    """Of rocks at motions (motions, rocks)."""
+    """Return terms of the log-likelihood at motions (motions, rocks)."""
     likelihood, arrays = rk.inverse.Likelihood(seen, rk.SinePulse, scatter), np.broadcast_arrays(*values.values())
     count = arrays[0].size
     # As many at a time as `feasible_region` takes: one compiled program.
@@ -197,7 +197,7 @@ def test_slopes_that_were_not_computed_are_refused(what):
 
 @pytest.mark.parametrize("scatter", [0.2, 0.45])
 def test_slopes_by_the_scatter(scatter):
-    """Of margins that are straight: P = Phi(ln(critical/amplitude)/scatter), and its slope."""
+    """Check slopes for straight margins: P = Phi(ln(critical/amplitude)/scatter), and its slope."""
     critical, strength = np.log([0.22, 0.27, 0.36, 0.4] * 3), np.log(0.3)
     (found, _), (slopes, _) = map(np.asarray, stands(scatter, critical, strength))
     z = (critical - strength) / scatter
@@ -251,7 +251,7 @@ def test_slopes_that_there_are_not_are_refused(what):
 
 
 def truth(seed, scatter=SCATTER):
-    """What twelve rocks do under the true motion, with all that scatters."""
+    """Draw the observations of twelve rocks under the true motion, with all scatter."""
     e = np.random.default_rng(seed).normal(size=(3, 12))
     alpha, p = ALPHA * np.exp(0.04 * e[0]), P * np.exp(0.02 * e[1])
     size = TRUTH["amplitude"] * np.exp(scatter * e[2])
@@ -472,7 +472,7 @@ def test_up_to_the_unexceeded_motion_all_that_stand_stand():
 
 
 def test_the_command_from_a_table_to_figures(tmp_path, capsys, monkeypatch):
-    """What it asks for, and that what is found is in its tables."""
+    """Check the command from a table of rocks to figures: its options, and results in its tables."""
     estimate_motion, asked = rk.inverse.estimate_motion, []
 
     def noted(*given, **named):
@@ -568,7 +568,7 @@ def test_the_example_is_read_and_says_what_people_say(tmp_path, capsys):
 
 
 def test_all_columns_of_a_file_are_told(capsys):
-    """To who asks for help, reads the docstring, or the page about rocks."""
+    """Check that `--help`, the docstring and the page about rocks list all columns of a file."""
     with pytest.raises(SystemExit):
         main(["invert", "--help"])
     page = (Path(__file__).parents[1] / "docs" / "how_to" / "rock.md").read_text()
@@ -640,7 +640,10 @@ LIKELIHOOD = rk.inverse.Likelihood(rk.inverse.Observations(ALPHA, P, ["survived"
 
 
 def test_unexceeded_records():
-    """Of one shape and several durations, which share samples: as each alone. Amplitudes are what motions are given."""
+    """Check records of one shape and several durations, which share samples: as each alone.
+
+    The amplitudes are those that the motions are given.
+    """
     seen, shape = rk.inverse.Observations([0.12], [3.0], ["survived"]), 0.5 * np.sin(np.linspace(0, 2 * np.pi, 20))
     quick = {"model": rk.Linear(), "engine": rk.Series(order=6)}  # compiles in half the time
     make = lambda amplitude, duration: amplitude * rk.Record(shape, duration / 19)
@@ -712,7 +715,7 @@ def test_wrong_arguments_are_named(wrong, message):
 
 
 def test_observations_of_traced_values():
-    """What is known of them is known within `jax.jit`, too, and what is wrong raises there."""
+    """Check observations of traced values: shapes are known within `jax.jit`, and wrong values raise there."""
     words = ["survived", "toppled", "rotation"]
     given = {"alpha_sd": 0.01, "rotation": 0.05, "rotation_sd": 0.01}
 

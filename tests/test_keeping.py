@@ -1,4 +1,4 @@
-"""What is kept between sessions: found again, refused when it is damaged, made anew when anything changed."""
+"""Programs kept between sessions: found again, refused when damaged, made anew when a dependency changed."""
 
 import gc
 import logging
@@ -111,7 +111,7 @@ def test_many_write_at_once(place):
 
 
 def test_facts_of_a_question():
-    """The same where only numbers differ; another for another kind, setting, shape or type of numbers."""
+    """Check the facts of a question: equal if only numbers differ, others for another kind, setting, shape or type."""
     block, pulse = rk.Block(0.2, 2.0), rk.SinePulse(0.3, 0.8)
     known = facts.facts((block, pulse, rk.Series()))
     assert known is not None
@@ -195,7 +195,7 @@ print(end="\\0", flush=True)
 
 
 def sessions_of(place, questions):
-    """What two sessions say that answer `"all"` questions, a `"few"`, which are the first of these, or `"one"`."""
+    """Return the output of two sessions that ask `"all"` questions, a `"few"` (the first of these), or `"one"`."""
     environment, words = os.environ | {"JAXROCK_CACHE": str(place)}, [sys.executable, "-c", _ANSWER, questions]
     done = subprocess.run(words, env=environment, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr
@@ -203,8 +203,10 @@ def sessions_of(place, questions):
 
 
 class Told(NamedTuple):
-    """What a session has said: how many programs were traced, numbers; and of its own program a number, how often
-    JAX's cache had not what it needed, and what a check has said."""
+    """Output of a session: the number of programs traced, and numbers.
+
+    For its own program also a number, how often JAX's cache missed, and a check's message.
+    """
 
     traced: int
     numbers: str
@@ -322,7 +324,7 @@ def test_nothing_is_kept_where_the_environment_says_so(monkeypatch, said):
 
 
 def test_what_is_imported_meanwhile():
-    """Garbage may be collected at any tuple that is made, and others may run then."""
+    """Check `changes` while modules are imported by a garbage collection, which may run at any allocation."""
     names = [f"nobody_knows_{number}" for number in range(10_000)]
     left = iter(names)
 
@@ -344,7 +346,10 @@ def test_what_is_imported_meanwhile():
 
 @pytest.mark.parametrize("kind", ["a class", "a module", "code in place"])
 def test_what_is_patched_asks_anew_and_is_kept_for_nobody_else(place, monkeypatch, kind):
-    """A test that patches the package, a notebook that loads an edited module again."""
+    """Check that patched code recomputes and is kept for no other session.
+
+    Examples are a test that patches the package, and a notebook that loads an edited module again.
+    """
 
     def ask():
         jax.clear_caches()
@@ -423,13 +428,16 @@ def test_programs_of_a_moment():
 
 
 def test_options_of_programs_of_a_moment():
-    """What this jaxlib knows of them: LLVM's effort always, XLA's emitters as long as there are others."""
+    """Check options of quickly compiled programs: LLVM's effort always, XLA's emitters while a choice exists."""
     assert {"xla_backend_optimization_level": 0} == {k: v for k, v in options().items() if "emitters" not in k}
     assert ("xla_cpu_use_fusion_emitters" in options()) or jaxlib.version.__version_info__[:2] > (0, 10)
 
 
 def test_scenes_that_xla_runs_are_compiled_well(monkeypatch):
-    """What is compiled quickly runs three times as long: that matters where scenes are no machine code."""
+    """Check that scenes that XLA runs are compiled thoroughly.
+
+    Code compiled with little effort runs three times as long, which matters only without machine code of the package.
+    """
     ways = []
 
     def jit(function, **settings):
@@ -447,7 +455,10 @@ def test_scenes_that_xla_runs_are_compiled_well(monkeypatch):
 
 
 def test_sweeps_are_compiled_as_what_is_in_them_wants(monkeypatch):
-    """What has no loops or is light, of few points, in the least time; all else as well as XLA can."""
+    """Check that the content of sweeps chooses their compilation.
+
+    Programs without loops and light functions of few points take the least time; all others use XLA's best.
+    """
     ways = []
     compiled = jax.stages.Lowered.compile
 

@@ -18,7 +18,7 @@ SAMPLERS = {"NumPyro": 6, "AutoLaplace": 7, "BlackJAX": 8, "tempered": 9}
 
 @pytest.fixture(scope="module")
 def names():
-    """What the first recipe defines."""
+    """Names that the first recipe defines."""
     known = {}
     exec(BLOCKS[0], known)
     return known

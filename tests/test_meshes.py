@@ -217,7 +217,7 @@ def test_a_cut_is_the_slab_of_its_outline(name):
 
 
 def test_what_a_plane_cuts_out_of_an_ellipsoid():
-    """An ellipse: area pi a c, second moment (a^2 + c^2)/4; with a hole where the body has one."""
+    """Compare the cut of an ellipsoid with an ellipse: area pi a c, second moment (a^2 + c^2)/4; also with a hole."""
     a, c, inner = 0.5, 0.8, ellipsoid(0.2, 0.2, 0.2)
     inner.invert()
     whole = trimesh.util.concatenate([ellipsoid(a, 0.6, c), inner])

@@ -540,7 +540,7 @@ def test_a_late_motion_does_what_it_does_early(delay):
 
 @pytest.mark.parametrize("delay", [1e6, 1e9, 9e11])
 def test_two_late_motions_say_how_late_they_may_be(delay):
-    """Of a sum the rounded times of the one beside the other count, and `error` knows."""
+    """Check that two late motions report rounding: a sum counts the rounded times of both, and `error` includes it."""
     early, late = of_two_late_ones(0.0), of_two_late_ones(delay)
     off = abs(float(late.max_rotation) - float(early.max_rotation))
     assert off <= float(late.error) <= 1e-14 * delay
@@ -558,7 +558,7 @@ def test_late_in_single_precision():
 
 
 def test_sums_of_many_motions_are_small_programs():
-    """What a sum tells it asks of its parts once: else a program would double with every motion that is added."""
+    """Check that programs of sums stay small: a sum queries its parts once, else each motion doubled the program."""
 
     def operations(count):
         motion = functools.reduce(operator.add, [rk.SinePulse(0.2, 1.0 + k).shifted(0.1 * k) for k in range(count)])

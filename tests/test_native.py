@@ -82,7 +82,10 @@ def of_shared(leaves):
 
 
 def test_what_all_share_is_computed_once_in_a_lane(caplog, monkeypatch):
-    """By machine code, as that of a lane's own is, to the bit; where it does not know that after all, by XLA."""
+    """Check that values shared by all lanes are computed once, in a lane, to the bit.
+
+    If machine code lacks an operation of theirs after all, XLA computes them.
+    """
     alpha, a, values = np.float64(0.3), np.arange(20.0), np.sin(np.arange(100.0))
     found = run(of_shared, [alpha, a, values], [True, False, True])
     own = run(of_shared, [np.full(20, alpha), a, values], [False, False, True])
@@ -125,7 +128,7 @@ FUSED = {
 
 @pytest.mark.parametrize("name", FUSED)
 def test_products_that_are_added_to_something(name):
-    """What is one operation then, as machine code, as XLA has it, and with the signs of zeros."""
+    """Check products that are added: with and without fusion in machine code, as in XLA, and with signs of zeros."""
     function, count = FUSED[name]
     values = np.random.default_rng(4).normal(size=(3, 20))
     values[:, -8:] = np.array(list(itertools.product([0.0, -0.0], repeat=3))).T
@@ -154,7 +157,7 @@ def test_they_are_rounded_once():
 
 
 def test_one_of_two_long_lists():
-    """Which list a lane looks into may change from turn to turn, and with it where what comes out of a loop points."""
+    """Check a choice between two long lists, which may change from turn to turn, as may the results of a loop."""
 
     def function(x, here, there):
         def turn(carry):
@@ -226,7 +229,7 @@ SINGLE = "sum", "quotient", "smaller", "sign", "to even", "whole", "chosen"
 
 @functools.cache
 def of_real_numbers(kind, names):
-    """Of each operation its result by machine code, and by JAX: of all in one program."""
+    """Return, for each operation, results by machine code and by JAX, computed in one program."""
     with np.errstate(over="ignore"):
         x, y = NUMBERS.astype(kind), OTHERS.astype(kind)
     return dict(zip(names, zip(*both(lambda x, y: [REAL[name](x, y) for name in names], x, y))))
@@ -307,7 +310,7 @@ FUNCTIONS = {
 
 @functools.cache
 def of_functions():
-    """Of each function its argument and its result, in one program of lanes that are as many for each."""
+    """Return, for each function, its argument and its result, in one program with equally many lanes for each."""
     lanes = max(x.size for _, x in FUNCTIONS.values())
     functions, given = zip(*((function, np.resize(x, lanes)) for function, x in FUNCTIONS.values()))
     found = run(lambda leaves: [f(x) for f, x in zip(functions, leaves)], given, [False] * len(given))
@@ -344,7 +347,7 @@ def test_quotients_of_integers():
 
 
 def test_what_is_not_known_at_first_is_done_before():
-    """By XLA, for all lanes; so is what they share."""
+    """Check that XLA first computes, for all lanes, what machine code cannot, and the values that lanes share."""
 
     def function(x, table):
         start = jnp.sort(jnp.stack([x, -x]))[1] + jnp.cumsum(table)[-1]
@@ -550,7 +553,7 @@ def test_cases():
 
 
 def test_what_a_loop_does_not_change():
-    """It is computed before the loop, whichever loop or case it stands in; numbers that are looked up change."""
+    """Check that loop invariants are computed before the loop, in whichever loop or case; looked-up numbers change."""
 
     def function(x, table, knots):
         def step(s):
@@ -652,7 +655,7 @@ SMALL_ARRAYS = {
 
 @functools.cache
 def of_small_arrays():
-    """Of each its result by machine code, and by JAX; in a loop, where XLA cannot do them before."""
+    """Return results by machine code and by JAX, in a loop, where XLA cannot compute them beforehand."""
 
     def in_a_loop(*given):
         def once(carry):
@@ -726,7 +729,7 @@ def rows(x):
 
 
 def turns(x):
-    """Of a number that is not known: the loop stays, but what is the same in all its turns is known in it."""
+    """A loop with an unknown number of turns: the loop stays, and its invariants are known in it."""
 
     def turn(carry):
         total, flag, table, odd, late = carry
@@ -743,7 +746,7 @@ def zeros_of_both_signs(x):
 
 
 def bits(x):
-    """Of whole numbers, which are no flags."""
+    """Bit operations on whole numbers, which are no flags."""
     whole = jnp.arange(5) + 8
     return [jax.lax.reduce_or(whole, [0]) + x, jax.lax.reduce_and(whole, [0]) + x, jnp.any(whole > 3) & (x > 0)]
 
@@ -786,7 +789,10 @@ def test_what_nobody_needs_is_left_out():
 
 
 def test_what_calls_back_is_left_to_xla():
-    """It may stand where it is called only if something is wrong: of all lanes at once it would always be."""
+    """Check that programs that call back to Python are left to XLA.
+
+    A call may stand where it happens only on failure; for all lanes at once it would always happen.
+    """
 
     def function(x):
         return [eqxi.unvmap_any(x > 3) * eqx.error_if(x, x < 0, "negative")]
@@ -804,7 +810,7 @@ UNKNOWN = {
 
 @pytest.mark.parametrize("name", UNKNOWN)
 def test_what_is_not_known_is_said(name):
-    """After a loop, or in it; before it XLA does it."""
+    """Check the log of operations that machine code cannot do: in a loop or after it; before a loop XLA does them."""
 
     def doubled(x, more=lambda x: x):
         return jax.lax.while_loop(lambda x: jnp.abs(x) < 50, lambda x: 2 * x + jnp.abs(more(x)), x + 1)
@@ -850,7 +856,7 @@ def by_diffrax(a, u, motion=rk.SinePulse(1.0, 1.0), model=rk.Housner(), **settin
 
 
 def rolled(a, u):
-    """Whose radii are told at more angles than registers keep."""
+    """A block whose edge radii are given at more angles than registers hold."""
     angles = jnp.linspace(0.0, 0.5, 10)
     edges = rk.blocks.Edge(0.3 * jnp.cos(angles), angles), rk.blocks.Edge(0.1 + 0.2 * angles[:7], angles[:7])
     block = rk.blocks.AsymmetricBlock(a, 1.2 * a, 2.0)
@@ -899,8 +905,11 @@ BESIDE = {"parameter", "constant", "get-tuple-element", "bitcast", "copy", "tupl
 
 @pytest.mark.parametrize("size, most", [(8, 18), (65, 18), (None, 32)], ids=["few", "many", "a history"])
 def test_xla_compiles_little_beside_machine_code(size, most):
-    """Nearly every operation that it is left is a program of its own: 28 and 30 of scenes that share a block, 38 of a
-    history, before what they share, and what a history begins and ends with, was machine code, too."""
+    """Check that XLA compiles little beside machine code: nearly every operation left to it is a program of its own.
+
+    Without machine code for shared values, 28 and 30 operations are left for scenes that share a block. Without it for
+    the beginning and end of a history, 38 are left.
+    """
     shaken = jax.vmap(lambda alpha, a: rk.outcome(rk.Block(alpha, 2.0), rk.SinePulse(a, 0.6)), (None, 0))
     if size is None:
         shaken = lambda alpha, a: rk.simulate(rk.Block(alpha, 2.0), rk.SinePulse(a, 0.6)).trajectory
@@ -909,7 +918,7 @@ def test_xla_compiles_little_beside_machine_code(size, most):
     assert 0 < sum(each not in BESIDE for each in operations) <= most
 
 
-# What the others are made of.
+# Components of the others.
 FALL_BACK_SLOWLY = (
     *("a scaled record", "vertical records"),
     *("its derivatives by diffrax", "another solver of diffrax", "diffrax under a record"),
@@ -931,7 +940,7 @@ def test_scenes_do_not_fall_back(name, caplog):
     [("derivatives", 40), ("spring", 40), *(pytest.param(x, 100, marks=pytest.mark.slow) for x in SCENES)],
 )
 def test_at_any_effort(name, count, monkeypatch):
-    """What LLVM compiles quickly, as for tests, answers as what it takes its time for: the same to the bit."""
+    """Check that LLVM's low effort, as in tests, gives the bits of its high effort."""
     a, u = np.random.default_rng(5).uniform([[0.1], [0.2]], [[0.3], [2.0]], (2, count))
     found = []
     for effort in (0, 3):
@@ -943,11 +952,11 @@ def test_at_any_effort(name, count, monkeypatch):
 
 
 def all_of_it(_, u):
-    """Errors have the most digits that may differ."""
+    """Return a complete outcome; its error estimates have the most digits that may differ."""
     return rk.outcome(rk.Block(0.2, 2.0), rk.SinePulse(u, 0.8))
 
 
-# Of edges that are lists XLA computes what comes first, and rounds it as it finds best.
+# With edges that are lists, XLA computes the first stages and rounds them in its own way.
 ONE_ANSWER = [x for x in SCENES if x not in ("derivatives", "rolling on edges of two sides")]
 
 
@@ -979,7 +988,7 @@ def with_effort(effort: int, monkeypatch):
 
 
 def test_closed_forms_at_any_effort(monkeypatch):
-    """Of one number, as users have them, and of many."""
+    """Check closed forms at both efforts: of one number, as users have them, and of many."""
     durations, shapes, found = np.linspace(0.5, 3.0, 9), np.linspace(-0.5, 0.9, 9), []
     for effort in (0, 3):
         with_effort(effort, monkeypatch)
@@ -1029,7 +1038,10 @@ def test_diffrax_as_xla_has_it(name, monkeypatch):
     ],
 )
 def test_what_a_loop_does_not_change_comes_before_it(name, monkeypatch, caplog):
-    """The knots of two motions are sorted once, and the blocks do the same as where XLA runs all of it."""
+    """Check that loop invariants are computed first: the knots of two motions are sorted once.
+
+    Blocks give the results of a run entirely by XLA.
+    """
     given = np.full(20, 0.2), np.linspace(0.8, 2.0, 20)
 
     def lowered():
@@ -1103,7 +1115,7 @@ _I64 = ir.IntType(64)
 
 
 def in_memory(b, x, **settings):
-    """Where a value is put."""
+    """Return the memory location of a value."""
     rooms = b.alloca(x.type, 4)
     place = b.gep(rooms, [_I64(2)], **settings)
     b.store(x, place)

@@ -74,7 +74,7 @@ def test_notebook(path, monkeypatch, tmp_path_factory):
 
 
 def called(tree):
-    """Of every call of the package in some code: the function and the names of its arguments."""
+    """Return, for every call of the package in some code, the function and the names of its arguments."""
     for node in ast.walk(tree):
         if isinstance(node, ast.Attribute) and ast.unparse(node).startswith("rk."):
             yield ast.unparse(node), None
@@ -111,7 +111,7 @@ def with_fewer_points(notebook):
 
 @each(NOTEBOOKS)
 def test_what_readers_see(path):
-    """A title, sizes that are stated once, data in files, and what was drawn."""
+    """Check each notebook: a title, sizes stated once, data in files, and figures."""
     cells = nbformat.read(path, as_version=4).cells
     assert cells[0].cell_type == "markdown" and cells[0].source.startswith("# ")
     code = [cell for cell in cells if cell.cell_type == "code"]

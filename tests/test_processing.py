@@ -1,4 +1,4 @@
-"""What is done to records: each step against what it must leave alone, and what it must take away."""
+"""Processing of records: each step against what it must preserve and what it must remove."""
 
 import jax
 import numpy as np
@@ -60,7 +60,7 @@ def test_drift_of_the_velocity_is_taken_off(degree):
 
 @pytest.mark.parametrize("low, high, kept", [(None, 3.0, 1.0), (3.0, None, 8.0), (0.5, 3.0, 1.0), (3.0, 20.0, 8.0)])
 def test_filters_keep_what_passes(low, high, kept):
-    """Of 1 Hz and 8 Hz at once: one passes, without delay."""
+    """Check a filter on 1 Hz and 8 Hz together: one passes, without delay."""
     parts = {f: np.sin(2 * np.pi * f * TIME) * np.exp(-((TIME - 5) ** 2)) for f in (1.0, 8.0)}
     found = do.filtered(rk.Record(sum(parts.values()), DT), low, high)
     assert np.abs(found.samples - parts[kept]).max() < 0.03

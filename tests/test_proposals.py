@@ -81,7 +81,7 @@ def test_kernels_are_a_density_and_draws_have_it():
     ids=["2-D, 1/1000", "3-D, 1/200", "5-D, 1/100", "3-D, in a corner, 1/200", "5-D, in a corner, 1/50"],
 )
 def test_narrow_summits_are_learned(size, width, middle):
-    """Of a known summit, so many times narrower than the box; of the first points few, or none, are on its slopes."""
+    """Check a known summit many times narrower than the box; few or none of the first points are on its slopes."""
 
     def log_density(x):
         return -np.sum(((x - middle) / width) ** 2, axis=1) / 2
@@ -93,7 +93,7 @@ def test_narrow_summits_are_learned(size, width, middle):
     taken = np.mean(np.any(np.diff(chains.places, axis=0) != 0, axis=2))
     assert taken > 0.4 and len(drawn.rounds) < 9
     away = np.abs(chains.places[1:] - middle) / width
-    # Of 4,000 samples one in eight is independent, or more; distances are alike for half a normal distribution.
+    # One in eight of 4,000 samples or more is independent; distances are alike for half a normal distribution.
     np.testing.assert_allclose(away.mean(axis=(0, 1)), np.sqrt(2 / np.pi), atol=4 * 0.6 / np.sqrt(500))
     # What all points together say of the integral: weights are densities, and not only in proportion.
     half = 0.5 if middle in (0.0, 1.0) else 1.0

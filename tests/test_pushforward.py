@@ -41,7 +41,7 @@ def _doubled_until(x, y):
 
 
 def _newest(x, y):
-    """What moves in a loop only after some turns of it."""
+    """Return loop results that depend on the inputs only after some turns of the loop."""
     return lax.while_loop(lambda c: c[0] < 4, lambda c: (c[0] + 1, c[2], c[3], x * y), (0, 1.0, 2.0, 3.0))[1:]
 
 
@@ -153,7 +153,10 @@ MOVES = [(True, True), (True, False), (False, True)]
 
 @functools.cache
 def found_and_expected(case):
-    """Of `expected`, in three directions at once, and in one alone, for each of `MOVES`: all in one program."""
+    """Return found and expected values and derivatives for each of `MOVES`: in three directions at once and in one.
+
+    All are in one program.
+    """
     function, directions = OF_NUMBERS[case], np.array([[1.0, 0.3, 0.0], [0.0, -2.0, 1.0]])
     program = told(function, np.float64(X), np.float64(Y))
 
@@ -182,7 +185,7 @@ def test_beside_jax(case, moves):
     "case", ["a product", "a quotient", "a list by a number", "loops within", "operations of many"]
 )
 def test_twice(case):
-    """Of a program that was made so: second derivatives are those of JAX."""
+    """Differentiate a program that was itself made by forward mode: second derivatives are those of JAX."""
     function, moves = OF_NUMBERS[case], (True, True)
     unit = [np.array([1.0, 0.0]), np.array([0.0, 1.0])]
     once = told(lambda *x: pushed(told(function, *x), x, moves, unit, 2), np.float64(X), np.float64(Y))
@@ -223,5 +226,5 @@ def test_every_rule_is_asked():
     names = set()
     for function in OF_NUMBERS.values():
         names |= {equation.primitive.name for equation in told(function, X * 1.0, Y * 1.0).eqns}
-    # What JAX makes itself where it differentiates, and copies.
+    # Operations that JAX itself makes when it differentiates, and copies.
     assert {*PARTIALS, *MOVED, *OF_SOME, *STILL} <= names | {"add_any", "copy"}

@@ -1,7 +1,7 @@
-"""The quick pass that many scenes go through: the same results as the careful engine, a few scenes after the others.
+"""Fast pass for many scenes: it gives the results of the careful engine, run on a few scenes at a time.
 
-That few scenes, which the careful engine takes in lanes, are as each alone is in `test_suite_outcomes`; that many are,
-in `test_spectra`.
+`test_suite_outcomes` compares few scenes, which the careful engine takes in lanes, with each alone; `test_spectra`
+compares many.
 """
 
 import itertools

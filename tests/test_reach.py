@@ -79,7 +79,7 @@ def test_exact_pieces_are_those_of_the_series(dt):
 
 @pytest.mark.parametrize("dt", [0.005, 0.15])
 def test_what_is_told_of_a_piece_is_so(dt):
-    """One way: the velocity keeps its sign; steady: it grows, or falls; it is never faster than told."""
+    """Check the facts of a piece: one-way velocity keeps its sign, steady velocity grows or falls, and bounds hold."""
     exact, speeds = reached(reach._exactly, *drawn(), dt)
     speeds = np.asarray(speeds)
     signs = np.sign(speeds)

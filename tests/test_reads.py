@@ -1,4 +1,4 @@
-"""What a function reads: told where nothing can change unseen, and then it is traced once; else at every call."""
+"""Dependencies of a function: known where no hidden change is possible, and then traced once; else at every call."""
 
 import functools
 import math
@@ -87,7 +87,7 @@ TOLD = {
     "itself": of_itself,
     "derivatives": lambda x: jax.grad(lambda y: rk.outcome(rk.Block(0.2, y), rk.SinePulse(0.4, 1.0)).margin)(x),
 }  # fmt: skip
-# What these read may change where nobody sees it.
+# Variables of these functions may change where tracing cannot see it.
 NOT_TOLD = {
     "a list": reading_lists,
     "an array of NumPy": lambda x: CHANGING * x,
@@ -123,7 +123,7 @@ def test_not_told(name):
 
 
 def test_which_function_is_called_again_is_told():
-    """Of functions that hold the same others, in another order."""
+    """Check that the function called again is identified among functions that hold the same others in another order."""
 
     def held(a, b, c):
         return lambda x: a(x) + b(x) * c(x)

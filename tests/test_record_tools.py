@@ -1,4 +1,4 @@
-"""What records are made of: a displacement fused with an accelerometer, and the pulse in a record."""
+"""Derived records: a displacement fused with an accelerometer, and the pulse in a record."""
 
 import functools
 
@@ -40,7 +40,7 @@ def test_what_both_agree_on_stays_at_both_ends(begin, end):
 
 
 def test_two_bad_sensors_make_a_good_one():
-    """The accelerometer drifts, the displacement is noisy: together they know the ground's displacement."""
+    """Fuse two bad sensors: the accelerometer drifts and the displacement is noisy, but together they are accurate."""
     drifting = rk.Record(GROUND.samples + 0.003 * np.cos(0.2 * TIME) + 0.002, DT)
     noisy = PLACE + NOISE.normal(0, 1e-3, TIME.size)
     found = rk.processing.fused(drifting, 100 * noisy, DT, unit="cm", corner=0.3)

@@ -966,6 +966,6 @@ def test_an_at2_file_that_is_cut_within_its_last_number(tmp_path):
 
 
 def test_a_column_is_no_record():
-    """Of a file, say: it would be many records of one sample."""
+    """Check that a column of a file is refused: it would be many records of one sample."""
     with pytest.raises(ValueError, match=r"Argument `acceleration` must have its samples along the last axis"):
         Record(np.ones((500, 1)), 0.01)

@@ -148,7 +148,7 @@ def history(block, pulse, duration, times):
 
 
 def followed(block, pulse, start, duration, states):
-    """The same until a duration after a start, beside the states of a reference."""
+    """Follow a block for a duration after a start, to compare with the states of a reference."""
     times, *known = np.array(states, dtype=float).T
     end = start + duration
     times = np.minimum(np.pad(start + times, (0, 5 - len(times)), mode="edge"), end)

@@ -164,7 +164,7 @@ def followed(law, numbers, engine=SHORT):
 
 
 def test_a_law_that_does_not_change_is_a_number():
-    """Of the same numbers, by the code for laws that may change: peaks, margins and errors are the same."""
+    """Compare a constant law, in the code for changing laws, with a number: peaks, margins and errors agree."""
     plain, seeming = (followed(law, scenes(200)) for law in (0.9, rk.restitution.SpeedDependent(0.9, 0.9, 1.0)))
     lost = np.asarray(plain.overturned)
     assert 20 < lost.sum() < 180
@@ -503,7 +503,7 @@ def test_what_a_law_with_a_scale_of_its_own_has_not(refused):
 
 
 def test_an_elastic_pair_in_single_precision():
-    """Whose product rounding makes more than 1."""
+    """Check an elastic pair in single precision, whose product rounding makes larger than 1."""
     with jax.enable_x64(False):
         assert rk.restitution.PerSide(1.7, 1 / 1.7).first == np.float32(1.7)
         with pytest.raises(ValueError, match="at most 1"):

@@ -56,7 +56,7 @@ class Wheel(NamedTuple):
 
 @jax.jit
 def of_rolling(radius, alpha, p, ratio, states, openings):
-    """Accelerations at states, threshold, balance, its slope by the radius, and the work up to given angles."""
+    """Return accelerations at states, threshold, balance, its slope by the radius, and the work up to given angles."""
     moments = rk.models.Rolling(radius, inertia_ratio=ratio).moments(rk.Block(alpha, p))
 
     def told(state):
@@ -86,7 +86,10 @@ def test_the_equation_is_newtons(radius):
 
 
 def test_the_balance_has_second_derivatives():
-    """Those of its closed form, along slenderness and radius, of an `Equation` of which only values are known, too."""
+    """Compare second derivatives of the balance, along slenderness and radius, with its closed form.
+
+    An `Equation` of which only values are known is compared, too.
+    """
 
     def closed(z):
         return jnp.arctan2(jnp.sin(z[0]), jnp.cos(z[0]) - z[1])
@@ -109,7 +112,7 @@ def test_the_balance_has_second_derivatives():
 
 
 def test_the_judge_of_records_is_newtons():
-    """What is eliminated by hand is what is solved for; and a step of it, halved, errs by a sixteenth."""
+    """Check the judge of records against Newton's law: the elimination by hand, and halved steps (errors of 1/16)."""
     block, wheel = rolling.Rolling(0.3, 2.5, 0.3, 0.9, 0.7), Wheel(0.3, 2.5, 0.7, 0.3, 0.9)
     for opening, speed, push in ((0.0, 0.4, 0.5), (0.25, 1.0, -0.2), (0.7, 2.0, 0.1)):
         assert block.acceleration(opening, speed, push) == pytest.approx(
@@ -191,8 +194,10 @@ def test_the_tolerance_under_a_record():
 
 @pytest.mark.slow
 def test_long_rocking_is_decided():
-    """Of 40 blocks that rock under the built-in record, none or one is too close to call; verdicts and peaks of all
-    others are those of Newton's law by steps of Runge and Kutta, peaks within what they say of their errors."""
+    """Check long rocking under the built-in record: of 40 blocks at most one is too close to call.
+
+    Verdicts and peaks of the others agree with Newton's law by Runge-Kutta steps, peaks within their stated errors.
+    """
     random, record, count = np.random.default_rng(1), rk.example_record(), 40
     alpha, scale, p = random.uniform(0.12, 0.3, count), random.uniform(0.6, 1.6, count), random.uniform(1.5, 4.0, count)
     one = lambda a, p, s: rk.outcome(rk.Block(a, p), s * record, rk.models.Rolling(0.2))
@@ -254,7 +259,7 @@ def test_a_damper_on_two_sides():
 @pytest.mark.parametrize("above", [False, True])
 @pytest.mark.parametrize("edge", [0.5, rk.blocks.Edge([0.6, 0.2, 0.0], [0.0, 0.15, 0.3])], ids=["circle", "profile"])
 def test_what_topples_it_by_energy(edge, above):
-    """Height gained up to its balance: a little less speed, and it comes back; a little more, and it does not."""
+    """Check toppling by the height gained up to the balance: slightly less speed returns, slightly more does not."""
     alpha, p, model = 0.2, 2.0, rk.models.Rolling(edge)
     known = edge if isinstance(edge, rk.blocks.Edge) else rk.blocks.Edge(edge)
     arm = lambda x: np.sin(alpha - x) + quad(lambda y: np.cos(x - y) * float(known.at(y)), 0, x, points=(0.15, 0.3))[0]
@@ -275,7 +280,7 @@ def test_what_topples_it_by_energy(edge, above):
 @pytest.mark.slow
 @pytest.mark.parametrize("radius", [0.0, 0.5])
 def test_energy_on_the_way(radius):
-    """Of the body that rolls; a sharp edge is Housner's block."""
+    """Check the energy of a rolling body in motion; a sharp edge gives Housner's block."""
     block, model = rk.Block(0.25, 2.0), rk.models.Rolling(radius)
     response = rk.simulate(block, rk.RectangularPulse(0.0, 0.01), model, initial=(0.2, 0.0), duration=1.5, **EXACT)
     x, v = np.abs(np.asarray(response.rotation)), np.asarray(response.velocity) / 2.0
@@ -335,7 +340,7 @@ def piecewise(weight, radius, angle, opening):
 @pytest.mark.parametrize("count", [2, 5, 30])
 @pytest.mark.parametrize("first", [0.0, 0.05])
 def test_an_edge_of_many_angles_is_exact(count, first):
-    """From tiny openings to a lying block, at and between its angles: to rounding of each number itself."""
+    """Check an edge of many angles against piecewise integrals: from tiny openings to a lying block, to rounding."""
     random = np.random.default_rng(count)
     angle = first + np.concatenate([[0.0], np.cumsum(random.uniform(0.002, 2.4 / count, count - 1))])
     radius = random.uniform(0.0, 0.8, count)
@@ -379,7 +384,7 @@ def test_slopes_by_the_numbers_of_an_edge():
 
 
 def test_slopes_of_an_outcome_by_a_radius_of_many():
-    """Of a block with different edges, as differences have it."""
+    """Compare slopes by radii of a block with different edges with differences."""
     angle, block = np.linspace(0.0, 0.5, 10), rk.blocks.AsymmetricBlock(0.25, 0.3, 2.5)
 
     @jax.jit
@@ -413,8 +418,10 @@ def scene_of(known):
 
 
 def agrees(known, names, found, slopes, within, slopes_within):
-    """Compare values, and slopes by all numbers but an angle of zero: relative to themselves, or to value over
-    number."""
+    """Compare values, and slopes by all numbers but an angle of zero.
+
+    Slopes are relative to themselves, or to the value over the number.
+    """
     numbers = scene_of(known)[1]
     moving = np.flatnonzero(numbers)
     for name, value, row in zip(names, found, slopes, strict=True):
@@ -584,7 +591,7 @@ def test_the_plane_that_rocks_share():
 
 
 def test_forces_by_its_own_inertia_ratio():
-    """A symmetric block that rolls has the one of its model, whatever its law of restitution knows."""
+    """Check forces: a symmetric block that rolls uses the inertia ratio of its model, whatever its restitution uses."""
     block = rk.Block(0.2, 2.0, rk.restitution.Housner(0.7))
     scene = jax.jit(Scene.of)(block, SINE, rk.models.Rolling(0.1, inertia_ratio=0.6))
     assert [float(_ratio_of(scene, block, given)) for given in (None, 0.6)] == [0.6, 0.6]

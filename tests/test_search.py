@@ -38,7 +38,7 @@ def found(name):
 
 @pytest.mark.parametrize("name", rows)
 def test_maxima_and_intervals(name):
-    """Those of own climbers, whose maximum a grid judges elsewhere."""
+    """Compare maxima and intervals with those of the package's own climbers, whose maximum a grid judges elsewhere."""
     best, other = jax.device_get((found("own"), found(name)))
     assert abs(other.log_likelihood - best.log_likelihood) < 1e-5
     np.testing.assert_allclose(other.values, best.values, rtol=5e-3)

@@ -53,7 +53,7 @@ def test_rigid_blocks_of_one_slenderness_collapse():
 
 
 def peaks_of_sines(model, alpha, amplitude, ratio):
-    """Of blocks with p = 1 and restitution 0.85, with the number of impacts."""
+    """Return peaks and impact counts of blocks with p = 1 and restitution 0.85."""
     scenes = [((a, 1.0, 0.85), (b, 2 * np.pi / ratio), (0.0, 0.0)) for a, b in zip(alpha, amplitude)]
     found = hard_cases.outcomes("sine", model, rk.Series(), scenes)
     return found["max_rotation"], found["impact_count"]
@@ -233,7 +233,10 @@ def test_exponents_that_orientations_allow_and_that_scale(of_motion):
 
 @pytest.mark.parametrize("model", [rk.Linear(), rk.Housner()], ids=["slender", "rigid"])
 def test_what_orientations_say_is_a_mirror(model):
-    """What points along z changes its sign with the accelerations along x, in every model; not every model scales."""
+    """Check that orientations express a mirror: quantities along z change sign with the accelerations along x.
+
+    This holds in every model; not every model scales.
+    """
     block = rk.Block(0.3, 2.0, 0.85)
     one_side, other_side = (
         np.asarray(history(block, rk.SinePulse(a, 0.8), model, similarity.scales(block, 0.6))[0]) for a in (0.6, -0.6)

@@ -62,11 +62,11 @@ class Printed:
         return self.stage(time, *free, side, False)
 
     def at(self, time):
-        """Of the first excursion."""
+        """Return rotation and velocity of the first excursion at a time."""
         return self.through(time, self.A0, self.B0, -1)
 
     def after(self, time):
-        """After the impact."""
+        """Return rotation and velocity after the impact."""
         forced = self.impact < self.end
         A, B = self.constants(self.impact, 0, self.e * self.at(self.impact)[1], 1, forced)
         return self.through(time, A, B, 1) if forced else self.stage(time, A, B, 1, False)
@@ -86,7 +86,10 @@ def first_impacts(a, w):
 
 @functools.cache
 def of_scenes():
-    """Of each named scene, in closed form: twelve times, rotation and velocity then; its first impact, and how fast."""
+    """Return histories of each named scene in closed form.
+
+    These are twelve times, rotation and velocity then, its first impact, and how fast.
+    """
     a, w, e = np.array(list(SCENES.values())).T
     end = (2 * np.pi - np.arcsin(1 / a)) / w
     time = np.linspace(0.01, end + 4.0, 12, axis=1)
@@ -156,7 +159,7 @@ def test_histories_of_the_engine():
 
 @pytest.mark.slow  # fast: `test_sine_gradients` of what it is made of
 def test_derivatives():
-    """By time the velocity; by intensity, frequency ratio and restitution as central differences, in every stage."""
+    """Compare slopes in all stages: by time with the velocity; by intensity, ratio and restitution with differences."""
     x = np.array(
         [
             (early, *scene)

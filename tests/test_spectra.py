@@ -244,7 +244,7 @@ def test_surfaces_go_through_forward_mode(name):
 
 
 def elasticity(amplitude):
-    """Of the peak by the amplitude, and by everything."""
+    """Return elasticities of the peak by the amplitude, and by everything."""
     scene = rk.Block(0.2, 2.0, 0.9), rk.SinePulse(amplitude, 0.7)
     found = rk.studies.sensitivity(*scene, QUICK["model"], engine=QUICK["engine"]).max_rotation
     return found.derivative[3] * amplitude / found.value, found.elasticity

@@ -84,7 +84,7 @@ def imports_of(tree: ast.Module) -> set[str]:
 
 @functools.cache
 def imports() -> dict[str, set[str]]:
-    """Modules of the package that each file imports."""
+    """Return the modules of the package that each file imports."""
     return {name: imports_of(tree) for name, tree in trees().items()}
 
 
@@ -130,8 +130,7 @@ print(json.dumps(told | {"with figures": list(sys.modules)}))
 
 @functools.cache
 def imported() -> dict:
-    """What a fresh interpreter, with nothing set for JAX, tells of itself after it imported the package, and then when
-    it was asked for figures."""
+    """Return reports of a fresh interpreter without JAX settings: after the import, and after a use of figures."""
     environment = {key: value for key, value in os.environ.items() if not key.startswith("JAX_")}
     done = subprocess.run(
         [sys.executable, "-W", "error", "-c", IMPORTED],
@@ -276,7 +275,7 @@ def test_what_is_public_has_a_docstring():
 
 
 def functions_of(module, origin):
-    """What a user may call of a public name: the function, or the methods of the class."""
+    """Return callables of a public name: the function, or the methods of the class."""
     for node in trees().get(module, ast.Module([], [])).body:
         if getattr(node, "name", None) == origin:
             inner = node.body if isinstance(node, ast.ClassDef) else [node]
@@ -341,7 +340,7 @@ FOLDERS = ("jaxrock", "references", "benchmarks", "tests")
     ],
 )
 def test_what_tests_and_benchmarks_share_lies_in_references(folder, allowed):
-    """Tests import nothing of benchmarks, benchmarks nothing of tests; the package only itself."""
+    """Check imports: tests import nothing of benchmarks, benchmarks nothing of tests; the package only itself."""
     if not (ROOT / folder).exists():
         pytest.skip(f"needs the folder {folder} of the repository")
     homes = {path.stem: name for name in ("benchmarks", "tests") for path in (ROOT / name).glob("*.py")}
@@ -370,7 +369,7 @@ def test_unknown_names_raise():
         jaxrock.rock  # noqa: B018
 
 
-# What a module holds and changes while the program runs: every thread sees it. Why that is safe:
+# Module state that changes at run time is seen by every thread; each entry says why it is safe.
 SHARED = {
     "_undisturbed._pauses": "under its lock",
     "native.machine._registered": "under a lock",
@@ -418,7 +417,10 @@ def changed_within_functions(tree: ast.Module) -> set[str]:
 
 
 def test_what_threads_share_is_known():
-    """Nothing else at the level of a module changes; `functools.cache` is safe, and what is there once has a lock."""
+    """Check that other module-level state does not change.
+
+    `functools.cache` is safe, and lazily created singletons have a lock.
+    """
     found = {f"{name}.{each}" for name, tree in trees().items() for each in changed_within_functions(tree)}
     assert found == set(SHARED)
 

@@ -272,7 +272,7 @@ def test_against_an_established_package(clusters):
 
 
 def test_errors_for_few_motions():
-    """Of 15 motions with 12 scenes each: intervals of the jackknife hold the slope's truth more often."""
+    """Check errors of 15 motions with 12 scenes each: jackknife intervals cover the true slope more often."""
     inside = {"information": 0, "clusters": 0, "jackknife": 0}
     labels, repetitions = np.repeat(np.arange(15), N // 15), 40
     for seed in range(repetitions):
@@ -335,7 +335,7 @@ MANY = N // 4  # the program of the fits above
     ids=["parted", "all alike", "constant", "one level of both", "with counts", "a plane", "the same twice"],
 )
 def test_fits_that_fail_say_so(measures, fell, status):
-    """Of outcomes that are parted but for some on the border between, too: the likelihood of these has no maximum."""
+    """Check fits that fail, also of outcomes parted but for some on the border: their likelihood has no maximum."""
     fit = rk.hazard.fit_probit(measures, fell)
     assert fit.status == status
     assert np.isnan(fit.slopes).all() and np.isnan(fit.covariance).all()

@@ -55,7 +55,7 @@ NORTH, EAST = rk.Record(LINES, 0.2), rk.Record(LINES[::-1] / 2, 0.2)
 
 
 def peaks_of(factor):
-    """Of a suite that is made of a number: of a record, of both its components in two planes."""
+    """Return peaks of a suite made from a traced number: of a record, and of both its components in two planes."""
     both = rk.motions.Components(rk.Record(factor * LINES, 0.2), EAST)
     suites = [rk.motions.Suite([rk.Record(factor * LINES, 0.2), EAST]), rk.motions.Suite([both], azimuth=[0.3, 1.2])]
     return [peak for suite in suites for peak in (suite.peak_acceleration, suite.peak_velocity)]
@@ -324,7 +324,7 @@ def test_one_record_tells_nothing_of_others(turns):
 
 
 def test_motions_that_are_the_same():
-    """Whatever they are called, whichever function made them; not those of other samples, steps, or kinds."""
+    """Check that equal motions are one, whatever their names or constructors; other samples, steps, kinds are not."""
     same = [rk.Record([0.0, 0.3, 0.0], 0.4, name) for name in ("a", "b")]
     others = [rk.Record([0.0, 0.3, 1e-9], 0.4), rk.Record([0.0, 0.3, 0.0], 0.41), 2 * same[0], -1 * same[0]]
     others += [rk.SinePulse(0.3, 0.4), rk.CosinePulse(0.3, 0.4), 2 * rk.SinePulse(0.3, 0.4)]
@@ -340,7 +340,7 @@ def test_motions_that_are_the_same():
 
 
 def test_intervals_hold_for_few_motions():
-    """Of 300 suites of 10: standard errors hold the dispersion's truth far less often."""
+    """Check intervals of 300 suites of 10: standard errors cover the true dispersion far less often."""
     fits = [known(stripes(seed, 10).fit()) for seed in range(300)]
     off = [np.abs(np.log(f.fragility.dispersion / 0.35)) / np.sqrt(f.covariance[1, 1]) for f in fits]
     assert np.mean(np.array(off) < 1.96) < 0.85
@@ -405,7 +405,7 @@ TRUTH = rk.hazard.SurfaceFragility(*map(jnp.asarray, (0.15, -0.6, 0.3)))
 
 
 def true_share(acceleration, ratio):
-    """How probably `TRUTH` topples."""
+    """Return the true probability that `TRUTH` topples."""
     return ndtr(np.log(acceleration / (0.15 * ratio**-0.6)) / 0.3)
 
 

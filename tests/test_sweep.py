@@ -31,7 +31,7 @@ def test_whole_numbers_that_single_precision_lacks_are_refused():
 
 
 def simple(alpha, p):
-    """Something of every kind, which NumPy gives to the last bit."""
+    """Return results of every type, which NumPy computes to the last bit."""
     return {"sum": alpha + 16 * p, "above": alpha > p, "count": jnp.int32(8 * p), "pair": jnp.stack([alpha, p])}
 
 
@@ -143,7 +143,7 @@ def test_a_gpu_takes_all_lanes_at_once(monkeypatch, points, lanes):
 
 @pytest.mark.parametrize("points", [1, 64, 65, 100, 128, 129, 5000, 10**6])
 def test_whether_scenes_are_few_is_not_told_by_their_devices(points):
-    """Few of them go without a quick pass, which leaves other last digits."""
+    """Check that few scenes skip the fast pass, which changes last digits, independently of the number of devices."""
     few = {layout(points, devices, "cpu")[1] <= batching._FEW for devices in (1, 2, 3, 8, 64, 500)}
     assert few == {points <= batching._FEW}
 
@@ -159,7 +159,7 @@ def test_batches_are_of_few_sizes():
 
 
 def test_what_fills_a_batch_up_is_one_of_its_points():
-    """Any other point might take for ever."""
+    """Check that padding of a batch repeats one of its points: any other point might take for ever."""
     runner, seen = Runner(lambda x, _: x, (np.ones(1),), (), 0), []
     call = runner._call
     runner._call = lambda parts, *rest: seen.append(parts[0]) or call(parts, *rest)
@@ -285,7 +285,7 @@ def test_programs_of_scenes_are_told_apart():
 
 
 def fresh(code, *, seed="0"):
-    """What a fresh interpreter prints."""
+    """Return the output of a fresh interpreter."""
     done = subprocess.run(
         [sys.executable, "-c", code], env={"PYTHONHASHSEED": seed, "JAX_PLATFORMS": "cpu", "PATH": ""},
         capture_output=True, text=True, timeout=300,
@@ -325,7 +325,7 @@ for code in {codes}:
 
 @pytest.fixture(scope="module")
 def printed():
-    """What each code prints in a process of its own."""
+    """Return the output of each code in a process of its own."""
     codes = [FINGERPRINT, *PRINTED]
     return dict(zip(codes, fresh(COPIES.format(codes=codes)).split("\0")))
 
@@ -348,7 +348,7 @@ def test_cpu_devices_come_too_late():
 
 
 def test_sweeps_in_threads_keep_their_checks():
-    """What one thread traces does not lose another's checks of arguments."""
+    """Check sweeps in threads: tracing in one thread does not lose another's argument checks."""
 
     def swept(restitution):
         return rk.sweep(

@@ -1,4 +1,4 @@
-"""What must not change: mirror, similarity, time shift, superposition of motions, jit, vmap, order of the series."""
+"""Invariances: mirror, similarity, time shift, superposition of motions, jit, vmap, order of the series."""
 
 import equinox as eqx
 import jax
@@ -101,7 +101,7 @@ def test_mirrored_history(scene):
 
 
 def slower(motion, factor):
-    """The same motion, `factor` times as long."""
+    """Return the motion stretched to `factor` times its duration."""
     names = [name for name in vars(motion) if name in {"duration", "period", "center", "dt"}]
     return eqx.tree_at(
         lambda m: [getattr(m, name) for name in names], motion, [getattr(motion, name) * factor for name in names]
@@ -149,7 +149,7 @@ def test_superposition(scene):
 
 @scene_and_model
 def test_free_stage_is_what_integration_gives(scene, model):
-    """The energy argument against the integrated motion, which a silent tail forces upon the engine."""
+    """Compare the energy argument of the free stage with integration, which a silent tail forces."""
     first, again = run(scene, model), run(scene, model, silence=12.0)
     assert bool(again.overturned) == bool(first.overturned)
     np.testing.assert_allclose(again.margin, first.margin, rtol=1e-9)

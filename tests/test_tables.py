@@ -180,7 +180,7 @@ def test_slopes_are_told_by_parameter():
 
 
 def test_many_scenes_have_a_row_each():
-    """Those of `jax.vmap` are numbered; each history has its own time."""
+    """Check tables of `jax.vmap` results: scenes are numbered; each history has its own time."""
     quick = {"model": rk.Linear(), "engine": rk.Series(order=6)}  # compiles in half the time
     one = jax.jit(jax.vmap(lambda alpha: rk.outcome(rk.Block(alpha, 2.5), rk.SinePulse(0.3, 0.8), **quick)))
     found = one(np.array([0.1, 0.2, 0.3]))

@@ -146,7 +146,7 @@ def test_slopes(way, function, slopes):
 @pytest.mark.slow
 @pytest.mark.parametrize("way", ["jit", "vmap", "shard_map", "map", "cond", "checkpoint"])
 def test_histories_of_columns(way):
-    """Whose evaluation is an operation of XLA's, and not machine code that is called."""
+    """Check histories of columns, which XLA evaluates without machine code."""
 
     def of(amplitude):
         return rk.simulate(COLUMN, rk.SinePulse(0.95 * amplitude, 0.8), samples=9).rotation[3]
@@ -160,7 +160,7 @@ def test_histories_of_columns(way):
 
 
 def test_slopes_by_all_samples_within_shard_map():
-    """Of blocks that are dealt to devices, by a record which all of them share: the sum of what each tells."""
+    """Check slopes of blocks dealt to devices by all samples of one shared record: the sum of their contributions."""
     engine = rk.Series(order=4, tolerance=1e-3)  # few steps, of which both ways tell the same
     samples, alpha = jnp.asarray(0.3 * np.sin(0.3 * np.arange(70))), jnp.linspace(0.2, 0.3, 4)
 
@@ -177,7 +177,7 @@ def test_slopes_by_all_samples_within_shard_map():
 
 
 def step_of(function):
-    """Of differences; values of columns move by 1e-10 where the compiler rounds otherwise."""
+    """Return the step of differences; values of columns move by 1e-10 where the compiler rounds otherwise."""
     return 1e-4 if function is column else 1e-6
 
 
@@ -215,7 +215,7 @@ def exported(function, platforms, shape=()):
 
 
 def called_in(program):
-    """What a program calls that is not its own."""
+    """Return the operations that a program calls outside itself."""
     return set(re.findall(r"custom_call @(\w+)", program.mlir_module()))
 
 
@@ -279,8 +279,10 @@ LOWERED_SLOWLY = "under a record", "a map", "histories", "by diffrax"
 
 @pytest.mark.parametrize("name", [pytest.param(x, marks=SLOW) if x in LOWERED_SLOWLY else x for x in LOWERED])
 def test_programs_for_accelerators(name):
-    """Lowered where there is none: no code for this processor in it, no call back to Python, of bounded size. One
-    program is for all kinds of them."""
+    """Check programs for accelerators that are not present: no code of this processor, no call back, bounded size.
+
+    One program is for all kinds of them.
+    """
     function, shape, most = LOWERED[name]
     program = exported(function, ACCELERATORS, shape)
     assert program.platforms == ACCELERATORS
@@ -291,7 +293,7 @@ def test_programs_for_accelerators(name):
 
 
 def test_nonsense_is_data_in_exported_programs():
-    """There is nobody to raise an error there: no number is one, and the status says so."""
+    """Check that exported programs return nonsense as data: they cannot raise, so results are NaN with a status."""
 
     def found(amplitude, alpha):
         result = rk.outcome(rk.Block(alpha, 2.0, 0.9), rk.SinePulse(amplitude, 0.8), **QUICK)
@@ -308,7 +310,10 @@ def test_nonsense_is_data_in_exported_programs():
 
 
 def test_slopes_of_many_are_those_of_one_and_each_is_computed_once():
-    """Of one scene alone directions are scenes; a derivative does not know that it will be one of many."""
+    """Check that slopes of many scenes equal those of one, and that each is computed once.
+
+    Within one scene directions are scenes; `grad` may be vmapped later.
+    """
 
     def peak(x):
         return rk.outcome(rk.Block(0.2, x[0], x[1]), rk.SinePulse(x[2], 0.8), **QUICK).max_rotation
@@ -320,7 +325,7 @@ def test_slopes_of_many_are_those_of_one_and_each_is_computed_once():
 
 
 def test_functions_of_whole_numbers_are_exported():
-    """None of them can be none."""
+    """Check export of functions of whole numbers: integers cannot be NaN."""
     program = jax.export.export(jax.jit(differentiable(lambda n: {"twice": 2 * n, "half": n / 2})), platforms=["cpu"])
     made = program(jax.ShapeDtypeStruct((), jnp.int64))
     assert {name: float(x) for name, x in made.call(3).items()} == {"twice": 6, "half": 1.5}
@@ -332,7 +337,10 @@ def test_nonsense_raises_at_once_outside_of_jit():
 
 
 def off(function):
-    """How far one compiled within another program may be: machine code from beginning to end not at all."""
+    """Return the allowed relative difference between a function alone and within another program.
+
+    It is zero for machine code from beginning to end.
+    """
     return 0 if function in (outcome, closed_form) else 1e-9
 
 
@@ -421,7 +429,7 @@ def test_results_are_pickled_and_kept(name, tmp_path):
 
 @pytest.mark.slow
 def test_a_history_is_pickled_by_the_function_that_it_is_of():
-    """Whatever function of the same program was asked for before."""
+    """Check that a pickled history belongs to its function, even after one of an equal program was asked for."""
     nameless = rk.models.Equation(lambda rotation, block: jnp.sin(block.alpha - rotation), arm)
     for model in (nameless, rk.models.Equation(restoring, arm)):
         found = rk.simulate(BLOCK, PULSE, model, samples=9)
@@ -430,7 +438,7 @@ def test_a_history_is_pickled_by_the_function_that_it_is_of():
 
 @pytest.mark.slow
 def test_a_history_by_a_function_that_is_not_what_it_was(monkeypatch):
-    """Pickled by its name, as Python does it."""
+    """Check that a history of a changed function fails to load: it is pickled by its name, as Python does it."""
     found = pickle.dumps(RESULTS["history by an equation of one's own"]())
     code = restoring.__code__
     monkeypatch.setattr(restoring, "__code__", (lambda rotation, block: 2 * jnp.sin(block.alpha - rotation)).__code__)
@@ -474,7 +482,7 @@ def test_a_search_by_optax_under_vmap():
 
 
 def margin_by(x):
-    """Of a block, by the logarithms of a pulse's amplitude and period."""
+    """Return the margin of a block by the logarithms of a pulse's amplitude and period."""
     return rk.outcome(BLOCK, rk.SinePulse(jnp.exp(x[0]), jnp.exp(x[1])), **QUICK).margin
 
 
@@ -490,7 +498,7 @@ def by_adam(x):
 
 
 def root(x):
-    """Of the amplitude alone: as many equations as unknowns."""
+    """Return a residual of the amplitude alone: as many equations as unknowns."""
     solver = optimistix.Newton(rtol=1e-10, atol=1e-10)
     found = optimistix.root_find(lambda a, _: margin_by(jnp.stack([a, x[1]])) - 0.5, solver, x[0], max_steps=50)
     return jnp.stack([found.value, x[1]])
@@ -526,7 +534,7 @@ def test_settings_are_made_anywhere():
 
 
 def test_what_is_kept_belongs_to_no_trace():
-    """The first scene of a session may be asked for where JAX traces what is known."""
+    """Check that cached objects belong to no trace, even if JAX traces the first scene of a session."""
     _usual.clear()
     dealt(jax.vmap(outcome))(AT)
     assert not any(isinstance(x, jax.core.Tracer) for x in start_of((0.0, 0.0)))

@@ -1,4 +1,4 @@
-"""Trial steps outside of a range: with `throw=False` they are not numbers, which a status tells, and nothing raises."""
+"""Trial steps outside of a range: with `throw=False` they give NaN, which a status reports, and nothing raises."""
 
 import inspect
 
@@ -103,7 +103,7 @@ SCENES = {
 
 @pytest.mark.parametrize(("block", "motion", "more"), SCENES.values(), ids=SCENES)
 def test_scenes(block, motion, more):
-    """One without a restitution looks like a result otherwise, as long as it does not come to an impact."""
+    """Check scenes without a restitution, which look like results as long as they do not come to an impact."""
     outcome = rk.outcome(block, motion, **QUICK, **more, throw=False)
     assert no_result(outcome, [outcome.margin, outcome.max_rotation, outcome.time_of_max, outcome.error])
     history = rk.simulate(block, motion, **QUICK, **more, duration=2.0, samples=5, throw=False)
@@ -122,7 +122,7 @@ class Softer(rk.models.AbstractEquation):
 
 
 def test_a_model_of_ones_own_does_not_raise():
-    """Neither of a block that is none, nor where a parameter leaves no balance."""
+    """Check that a model of a user does not raise, for an invalid block or a parameter without a balance."""
     none, series = SCENES["alpha"][0], rk.Series()
     for block, strength in ((none, 0.9), (BLOCK, -0.9), (BLOCK, 0.9)):
         model = Softer(jnp.asarray(strength))
@@ -152,7 +152,10 @@ def test_whole_numbers_of_a_law_stay_whole():
 
 
 def test_a_history_that_is_none_tells_no_numbers_and_has_no_slopes():
-    """At any time, in both modes: a fit that steps out of the ranges goes on."""
+    """Check that an invalid history has NaN numbers and no slopes, at any time in both modes.
+
+    A fit that steps out of the ranges therefore goes on.
+    """
 
     def rotations(x):
         block = rk.Block(x[0], 2.0, x[1], throw=False)
@@ -182,7 +185,7 @@ def test_an_asymmetric_block_without_a_duration():
 
 
 def test_a_margin_that_is_no_number_is_never_successful():
-    """With or without `throw`."""
+    """Check that a NaN margin is never successful, with or without `throw`."""
     result = rk.outcome(rk.Block(0.2, 2.0, 1.3, throw=False), rk.SinePulse(0.5, 1.0), **QUICK)
     assert np.isnan(result.margin) and bool(result.status == rk.Status.not_finite)
 
@@ -206,7 +209,7 @@ def test_lanes():
 
 
 def test_scenes_go_on_to_share_a_record():
-    """Of which any may be no number: a copy for each would be gigabytes."""
+    """Check that scenes, any of which may be invalid, share a record: a copy for each would be gigabytes."""
     record = rk.Record(0.1 * np.sin(np.arange(123)), 0.02)
 
     def margin(alpha):
@@ -244,7 +247,7 @@ def test_an_optimiser_without_bounds():
 
 
 def test_the_log_density_of_any_point():
-    """Infinite ones are ends of ranges; for what is not a number nothing is likely."""
+    """Check the log-density of any point: infinite ones are ends of ranges; NaN has no likelihood."""
     rocks = rk.inverse.Observations([0.2], [2.0], ["survived"])
     unknowns = {"amplitude": rk.inverse.Unknown(0.1, 1.0), "period": rk.inverse.Unknown(-0.5, 1.0, log=False)}
     density = rk.inverse.log_density(rocks, rk.SinePulse, unknowns, **QUICK)

@@ -1,4 +1,4 @@
-"""What the series of a step under a record leaves out, beside what its last terms say, from starts of every kind."""
+"""Truncation error of a step under a record, beside the estimate from its last terms, for starts of every kind."""
 
 import functools
 from dataclasses import replace
@@ -45,8 +45,10 @@ def starts(random):
 
 
 def left_out(model, has_vertical, columns):
-    """Of a step over a whole piece: what its last terms say is left out, what those after them come to, and how much is
-    allowed."""
+    """Return, for a step over a whole piece: the estimated and actual truncation, and the allowance.
+
+    The last terms give the estimate, the terms after them the actual error.
+    """
 
     def one(alpha, stretch, opening, velocity, now, then, vertical):
         def record(first):  # it has many pieces

@@ -38,7 +38,7 @@ def that_returns_what_it_is_given(x, y):
 
 
 def of_rows(x, y):
-    """What takes or makes rows stays a scan."""
+    """Check that loops that take or make rows stay scans."""
     return lax.scan(lambda total, row: (total + row * x, total), y, jnp.arange(4.0))[1][3]
 
 
@@ -70,7 +70,7 @@ class Halved(rk.Linear):
 
 
 class HalvedTwice(rk.Linear):
-    """The same, from double of them."""
+    """A model equal to `Halved`, from double of the moments."""
 
     def moments(self, block):
         return super().moments(block).times(lax.fori_loop(0, 2, lambda _, part: part / 2, 2.0 + 0.0 * block.alpha))

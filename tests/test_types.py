@@ -1,5 +1,7 @@
-"""What type checkers are told is so. They read `references/typed_use.py` in `.ci/run`; here it runs, and every type
-that it states is held against the value."""
+"""Types that users see: `references/typed_use.py` states them, and this test compares them with the values.
+
+Type checkers read that file in `.ci/run`.
+"""
 
 import inspect
 

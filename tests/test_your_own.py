@@ -200,14 +200,14 @@ class Picked(rk.motions.AbstractMotion):
 
 @pytest.mark.parametrize("kind", [jnp.int32, jnp.int64])
 def test_what_is_declared_whole_stays_so(kind):
-    """A place in a list; nobody varies it."""
+    """Check that a whole number, such as a place in a list, stays so: no solver varies it."""
     motion = Picked(jnp.stack([CORNERS, 2 * CORNERS]), jnp.asarray(1, kind))
     assert rk.outcome(BLOCK, motion, **QUICK).max_rotation == rk.outcome(BLOCK, record(2.0), **QUICK).max_rotation
     assert "number" not in named(BLOCK, motion)
 
 
 def test_its_parameters():
-    """What is declared, with unit and range; numbers that are not declared; no arrays."""
+    """Check declared parameters, with unit and range, and undeclared numbers; arrays are none."""
     found = declarations(BLOCK, ramps())
     assert tuple(found) == ("amplitude", "alpha", "p", "restitution", "height", "step", "more")
     assert set(named(BLOCK, ramps())) == set(found)
@@ -386,7 +386,7 @@ def test_a_class_that_closes_over_a_traced_number():
 
 @pytest.mark.slow
 def test_the_orbit_of_functions_is_drawn():
-    """Of functions no manifold is known: the equilibria stand alone."""
+    """Check the orbit of functions: no manifold is known, so the equilibria stand alone."""
     model = rk.models.Equation(lambda x, b: jnp.sin(b.alpha - x), lambda x, b: jnp.cos(b.alpha - x))
     axis = rk.plot.phase(rk.simulate(BLOCK, rk.SinePulse(0.3, 0.6), model))
     assert axis.get_legend() is None and len(axis.lines) == 4
@@ -406,7 +406,10 @@ def standing(x, block):
 )
 @pytest.mark.parametrize("call", [rk.outcome, rk.simulate], ids=lambda call: call.__name__)
 def test_what_does_not_stand_by_its_equation_raises(call, parts, what):
-    """At the door, alone and under `jax.vmap`: what is compiled calls back to nothing, and JAX can keep it."""
+    """Check that an equation without a stable upright position raises when it is used, alone and under `jax.vmap`.
+
+    Compiled code makes no calls back, so JAX can keep it.
+    """
     model = rk.models.Equation(*parts)
 
     def scene(a):
@@ -418,7 +421,10 @@ def test_what_does_not_stand_by_its_equation_raises(call, parts, what):
 
 
 def test_what_is_no_smooth_linear_equation_raises():
-    """Dry friction jumps at rest, where the engine would miss impacts; its smooth form and a damper do not."""
+    """Check that equations that are not smooth and linear raise: dry friction jumps at rest and hides impacts.
+
+    Its smooth form and a damper do not.
+    """
 
     def equation(dissipation):
         return rk.models.Equation(standing, dissipation=dissipation)
@@ -494,7 +500,7 @@ def test_a_moment_that_rights_again_is_for_diffrax():
 
 @pytest.mark.slow
 def test_what_no_help_is_needed_for_comes_back():
-    """The arm is negative far out, where the push that helps is the one that drove before; by SciPy's DOP853."""
+    """Check a return from far out, where the arm is negative and the driving push helps; by SciPy's DOP853."""
     model = rk.models.Equation(
         restoring=lambda x, b: jnp.sin(b.alpha) + 1.5 * x, arm=lambda x, b: jnp.cos(b.alpha - x), falls_flat=False
     )
@@ -556,7 +562,7 @@ def _is_lost(model, ceiling, opening):
     ids=["edge", "circle", "tether", "no tether", "rising terms", "turning arm", "little help", "growing arm"],
 )
 def test_what_may_be_held_further_on_is_not_lost(model, ceiling, opening, lost):
-    """Past its balance, where nothing holds the block, it is lost only where nothing does up to pi/2."""
+    """Check loss past the balance: the block is lost only if nothing can hold it up to pi/2."""
     assert bool(_is_lost(model, jnp.asarray(ceiling), jnp.asarray(opening))) == lost
 
 
@@ -592,7 +598,7 @@ def test_speed_that_is_enough_under_the_most_helpful_forcing(restoring, arm, pus
 
 
 def test_factors_of_functions_multiply():
-    """As those of other moments."""
+    """Check that factors of functions multiply, as those of other moments."""
 
     @jax.jit
     def found(x):
