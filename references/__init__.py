@@ -1,4 +1,4 @@
-"""What tests and benchmarks judge jaxrock by: reference solutions, the programs that made them, hard scenes.
+"""References that judge jaxrock in tests and benchmarks: solutions, the programs that made them, hard scenes.
 
 Not installed. Generators run from the root as modules: `python -m references.derivatives`.
 Imports jaxrock where a motion or a scan is taken from it, and nothing of tests or benchmarks.

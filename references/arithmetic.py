@@ -41,7 +41,7 @@ class Arithmetic:
         return self.number(10) ** exponent
 
     def mpf(self, x):
-        """The same number for mpmath, exactly."""
+        """Convert the number to mpmath, exactly."""
         if self.backend == "mpmath":
             return x
         mantissa, exponent = x.as_mantissa_exp()

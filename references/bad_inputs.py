@@ -38,7 +38,7 @@ TIMES = np.linspace(0.0, 2.0, 24)
 
 
 class Call(NamedTuple):
-    """What is called, with arguments that work."""
+    """A callable, with arguments that work."""
 
     function: Callable
     good: dict[str, Any]
@@ -828,7 +828,7 @@ _NAMED = re.compile(r"`[^`]+`|^File |(missing|unexpected) .*argument|unsupported
 
 
 def verdict(name: str, given: dict[str, Any]) -> str | None:
-    """What is wrong with how a call with these arguments ends; None: nothing."""
+    """Return the fault in the result of a call with these arguments; None if there is no fault."""
     call = CALLS[name]
     try:
         with warnings.catch_warnings():

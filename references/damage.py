@@ -110,7 +110,7 @@ def damaged(original: Path, copy: Path, seed: int) -> str:
 
 
 def loaded(path: Path, right: list[tuple]) -> str:
-    """What becomes of it when it is loaded: `right`, `refused` with its path; anything else fails."""
+    """Load a grid or store: return `right`, or `refused` with its path; any other result fails."""
     try:
         found = rk.studies.Grid.load(path)
     except (ValueError, FileNotFoundError) as error:
@@ -121,7 +121,7 @@ def loaded(path: Path, right: list[tuple]) -> str:
 
 
 def resumed(path: Path, right: list[tuple], function=swept) -> str:
-    """What becomes of it when its sweep goes on: `mended` with a warning that names files, `right`, or `refused`."""
+    """Resume a sweep: return `mended` with a warning that names files, `right`, or `refused`."""
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
         try:

@@ -226,7 +226,7 @@ def cut(text: str) -> Iterator[Damage]:
 
 
 def written_differently(text: str) -> Iterator[Damage]:
-    """The same in other encodings, with other line ends, other marks."""
+    """Yield the text in other encodings, with other line ends or other marks."""
     for encoding in ("utf-8-sig", "utf-16", "utf-16-le", "utf-16-be", "utf-32", "utf-7", "cp037", "latin-1", "cp1252"):
         yield Damage(encoding, text.encode(encoding), "same")
     for name, end in (("CRLF", "\r\n"), ("CR", "\r"), ("form feeds", "\f"), ("NEL", "\x85"), ("LFLF", "\n\n")):
@@ -274,7 +274,7 @@ def struck(text: str, random: np.random.Generator) -> Damage:
 
 
 def verdict(file: File, damage: Damage, folder: Path, truth: dict[str, np.ndarray]) -> str | None:
-    """What is wrong with how a damaged file is read; None: nothing."""
+    """Return the fault in how a damaged file is read; None if there is no fault."""
     path = folder / f"damaged{file.suffix}"
     path.write_bytes(damage.content)
     try:

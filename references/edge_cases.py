@@ -42,7 +42,7 @@ class Group:
 
     @property
     def name(self):
-        """What the tables call it."""
+        """Name of the group in the tables."""
         where = {"boundary": "boundary", "impacts": "touch", "hops": "small hops"}[self.edge]
         return f"{self.model}, {self.kind}, {where}" + (f" by {self.tuned}" if self.edge == "impacts" else "")
 
@@ -181,7 +181,7 @@ def on_the_edge(group, random):
 
 
 def as_reference(group, scene):
-    """The same scene for the reference."""
+    """Convert a scene to the arguments of the Taylor reference."""
     alpha, p, restitution, amplitude, duration, shape, delay, rotation, velocity = (float(x) for x in scene)
     numbers = (amplitude, duration, shape)[: 3 if group.kind == "exponential" else 2]
     options = {"model": group.model, "initial": (rotation, velocity)} | ({"delay": delay} if group.delayed else {})

@@ -268,7 +268,7 @@ def answers():
 
 
 def judge(known, found, bound, counted=True):
-    """What is wrong with one outcome (a dict of numbers) beside its reference; an empty string if nothing is.
+    """Return the faults of an outcome (a dict of numbers) beside its reference; an empty string if there are none.
 
     `bound`: of the peak's error over alpha, for a scene of condition 1; `counted`: whether impacts are.
     """

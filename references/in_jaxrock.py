@@ -1,4 +1,4 @@
-"""What the references' names mean in jaxrock: models and motions, those of the references' numbers."""
+"""Models and motions of jaxrock by the references' names and numbers."""
 
 import jaxrock as rk
 

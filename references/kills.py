@@ -116,7 +116,7 @@ def attack(kills: int, seed: int = 0, count: int = 4, block: int = 100) -> colle
 
 
 def work(own: int, count: int, port: int, block: int, store: str, begun: str) -> None:
-    """What every process does."""
+    """Run the sweep in one of the processes."""
     jax.config.update("jax_enable_x64", True)
     import jaxrock as rk
 

@@ -121,7 +121,7 @@ def history(scene, times=(), arithmetic=None):
 
 
 def _key(scene):
-    """What the answer depends on, exactly."""
+    """Return a text of all inputs of an answer, exactly."""
     block, kind, numbers, options = _scene(scene)
     words = [kind, *(repr(float(x)) for x in block)]
     if kind == "record":

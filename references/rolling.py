@@ -53,7 +53,7 @@ class Rolling(NamedTuple):
 
 
 class Found(NamedTuple):
-    """What became of a block: whether it fell, its largest rotation until then [rad], its impacts."""
+    """Outcome of a block: whether it fell, its largest rotation until then [rad], its impacts."""
 
     overturned: bool
     peak: float

@@ -30,7 +30,7 @@ ROOT = Path(__file__).parents[1]
 
 
 def told(tree) -> str:
-    """What tells an answer: every bit of it."""
+    """Return a digest of all bits of an answer."""
     found = hashlib.sha256()
     for leaf in jax.tree.leaves(tree):
         array = np.asarray(leaf)
@@ -39,7 +39,7 @@ def told(tree) -> str:
 
 
 def message(function: Callable) -> str:
-    """What a refusal says; of what JAX tells of it, the line that is ours."""
+    """Return the message of a refusal; of JAX's error text, the line of the package."""
     try:
         function()
     except Exception as error:
@@ -75,7 +75,7 @@ def saved(folder: Path, ending: str) -> rk.studies.Grid:
 
 
 def questions(folder: Path, few: bool = False) -> dict[str, Callable]:
-    """What is done, by name: each gives a pytree, or a text."""
+    """Return questions by name: each returns a pytree, or a text."""
     block, motion, pulse = rk.Block(0.2, 2.0), record(), rk.SinePulse(0.6, 0.9)
     strengths = jnp.linspace(0.1, 1.5, 70)
     cheap = {
@@ -103,7 +103,7 @@ def questions(folder: Path, few: bool = False) -> dict[str, Callable]:
 
 
 def answer(question: Callable) -> str:
-    """What tells its answer."""
+    """Return the digest, or the text, of an answer."""
     found = question()
     return found if isinstance(found, str) else told(found)
 
@@ -172,7 +172,7 @@ def _result(process: subprocess.Popen) -> dict:
 
 
 def work(plan: dict) -> None:
-    """What every process does: alone, or many threads at once."""
+    """Run the part of one process: alone, or with many threads at once."""
     warnings.simplefilter("error")
     jax.config.update("jax_enable_x64", True)
     folder = Path(plan["folder"])

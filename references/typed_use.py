@@ -1,4 +1,4 @@
-"""What users write, for type checkers: `mypy --strict` and pyright find nothing wrong here, and every type as said.
+"""Typical use, for type checkers: `mypy --strict` and pyright find no fault here, and every type is as stated.
 
 `.ci/run` has mypy read it; `tests/test_types.py` runs it, so that what checkers are told is so.
 """
@@ -94,7 +94,7 @@ class Brittle(rk.restitution.AbstractRestitution):
     speed: jax.Array
 
     def ratio(self, corners: rk.restitution.Corners, speed: jax.Array) -> jax.Array:
-        """Of the speeds after and before."""
+        """Return the ratio of the speeds after and before an impact."""
         return self.firm / (1 + speed / self.speed)
 
 
@@ -161,7 +161,7 @@ def rocks() -> None:
 
 
 def from_rocks() -> None:
-    """What rocks say about the shaking: docs/inverse.md, docs/concepts/fragility.md."""
+    """Estimate shaking from rocks: docs/inverse.md, docs/concepts/fragility.md."""
     seen = rk.inverse.Observations(alpha=[0.2, 0.3], p=[2.0, 2.5], seen=["toppled", "survived"])
     unknowns = {"amplitude": rk.inverse.Unknown(0.1, 1.5), "period": rk.inverse.Unknown(0.2, 1.5)}
     target = rk.inverse.log_density(seen, rk.SinePulse, unknowns)

@@ -243,7 +243,7 @@ def test_compiled_functions_do_not_see_names():
 
 @pytest.mark.parametrize("count", [17, 255, 256, 257, 513, 3000])
 def test_largest_values_from_each_piece_on(count):
-    """Of the next 16, the next 256, and all that follow."""
+    """Check the largest values of the next 16, the next 256, and all later pieces."""
     values = np.abs(np.random.default_rng(count).normal(size=count)) * np.exp(-np.arange(count) / count)
     wanted = [[values[i : i + most].max() for i in range(count)] for most in (count, 16, 256)]
     np.testing.assert_array_equal(jax.jit(outlook._maxima)(values), wanted)

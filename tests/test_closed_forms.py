@@ -20,7 +20,7 @@ ALPHA = 0.1  # plays no part in the linear model, whose results are over alpha
 
 
 def each(function, *values):
-    """What a function gives, asked element by element: XLA compiles every shape anew, and scalars in the least time."""
+    """Evaluate a function element by element: XLA compiles every shape anew, and scalars in the least time."""
     values = np.broadcast_arrays(*(np.asarray(value, float) for value in values))
     shape = values[0].shape
     found = [jax.device_get(function(*map(float, row))) for row in np.stack([x.ravel() for x in values], axis=-1)]

@@ -63,7 +63,7 @@ def at2(tmp_path):
 
 @pytest.fixture
 def column(tmp_path):
-    """The same record as a column of cm/s2."""
+    """Return a file with the record as a column of cm/s2."""
     path = tmp_path / "motion.csv"
     path.write_text("acceleration\n" + "".join(f"{float(a) * 980.665!r}\n" for a in SAMPLES))
     return str(path)
@@ -123,7 +123,7 @@ def test_run_on_the_built_in_record(command, tmp_path):
 
 
 def test_run_on_files(command, at2, column, tmp_path):
-    """The same record as AT2 in g and as a column in cm/s2: the same table."""
+    """Compare the tables of one record as AT2 in g and as a column in cm/s2."""
     status, table, errors = command("run", at2, *GIVEN)
     assert status == 0 and errors == ""
     assert table["title"] == "motion"

@@ -312,7 +312,7 @@ def recipe_in(jaxpr):
 
 
 def test_a_function_of_traced_numbers_keeps_its_kind_of_derivatives():
-    """What it holds of the trace around it becomes an argument, and nothing else changes."""
+    """Check that a captured tracer becomes an argument, and that the kind of derivatives stays."""
 
     def of(a):
         return differentiable(lambda x: a * x**2, derivatives="in a direction")(3.0)
@@ -335,7 +335,7 @@ def test_a_few_at_once():
     "motion, most", [(rk.SinePulse(0.5, 1.0), 2500), (rk.example_record(), 2000)], ids=["pulse", "record"]
 )
 def test_programs_are_small(motion, most):
-    """What JAX traces, batches and differentiates of an outcome for machine code; a first answer waits for it."""
+    """Bound the operations that JAX traces, batches and differentiates of an outcome: a first answer waits for them."""
     asked = jax.make_jaxpr(lambda alpha: rk.outcome(rk.Block(alpha, 2.0), motion))(0.2)
     recipe = recipe_in(asked.jaxpr)
     with marking(False):
@@ -425,7 +425,7 @@ def test_types_are_those_of_jax(first, second):
 
 
 def test_within_shard_map():
-    """Of numbers that differ along a mesh, and others that do not."""
+    """Check numbers that differ along a mesh, beside numbers that do not."""
     x = np.linspace(0.1, 0.4, 4)
     mesh = jax.sharding.Mesh(np.array(jax.devices()), ("parts",))
     every = jax.sharding.PartitionSpec("parts")

@@ -351,7 +351,7 @@ OF_HISTORY = ("rotation", "velocity", "second impact", "least normal", "largest 
 
 
 def a_history(x, duration):
-    """What `OF_HISTORY` says, at the time, by what `BY_HISTORY` says; with all its impacts."""
+    """Return the results `OF_HISTORY` at a time, by the numbers `BY_HISTORY`; and all impacts."""
     block, start = rk.Block(x[0], 2.0, 0.9), (x[3], x[4])
     found = rk.simulate(block, rk.SinePulse(x[1], x[2]), duration=duration, initial=start, samples=2, **QUICKLY)
     forces = rk.responses.contact_forces(found, block)
@@ -419,7 +419,7 @@ def test_slopes_of_forces_in_both_modes():
 
 @pytest.mark.slow
 def test_second_derivatives_of_a_history():
-    """Of rotations before and after impacts, and of the margin: differences of first derivatives, and symmetric."""
+    """Compare Hessians of rotations and of the margin with differences of gradients; they must be symmetric."""
     x = jnp.array([0.2, 2.0, 0.9, 0.26, 1.4, 1.7])
 
     def results(q):

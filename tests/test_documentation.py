@@ -43,7 +43,7 @@ def pages_with_snippets():
 
 @pytest.mark.parametrize("page", list(pages_with_snippets()))
 def test_every_snippet_of_a_page_runs(page, tmp_path, monkeypatch, caplog):
-    """Those that are read first by machine code: what XLA has to take over takes many times as long."""
+    """Run every snippet; pages in `QUICK` must leave nothing to XLA, which would take many times as long."""
     monkeypatch.chdir(tmp_path)
     with caplog.at_level(logging.DEBUG, "jaxrock"):
         exec(compile(snippets(page), page, "exec"), {"__name__": "__main__"})

@@ -253,7 +253,7 @@ def test_both_saddles_of_an_asymmetric_block_are_seen():
 
 
 def test_a_vertical_acceleration_moves_the_threshold():
-    """What presses the block down holds it: the block lifts where the ground's acceleration passes the line."""
+    """Check a vertical acceleration: a block pressed down lifts later, where the acceleration passes the line."""
     motion = rk.SinePulse(0.4, 1.0).with_vertical(rk.SinePulse(0.5, 0.5))
     response = rk.simulate(BLOCK, motion, **QUICK, duration=1.5)
     above, _, axis = rk.plot.history(response)

@@ -326,7 +326,7 @@ class Count(eqx.Module):
 
 
 def test_lanes_of_histories_are_not_copied_at_every_step():
-    """What is kept of each lane is written in place, and nothing is chosen between whole arrays of it."""
+    """Check that the data of each lane are written in place, without a select between whole arrays."""
 
     def run(last):
         start = Count(jnp.int32(0), last)

@@ -99,7 +99,7 @@ def test_the_rigid_limit(base, p_delta):
 @pytest.mark.parametrize("base", ["linear", "plastic"])
 @pytest.mark.parametrize("damping", [0.0, 0.01])
 def test_what_is_linear_stays_so(base, damping):
-    """The same steps with nothing beside the linear phase: the linear block's own answer."""
+    """Check that the nonlinear stepper without nonlinear terms gives the linear block's own answer."""
     block = rk.blocks.FlexibleBlock(**TALL, damping_ratio=damping, base=base)
     scene = NonlinearScene.of(block, PULSE, jnp.asarray(20.0))
 

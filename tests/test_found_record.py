@@ -242,7 +242,7 @@ def test_where_nothing_may_change():
 
 @pytest.mark.slow
 def test_what_cannot_be():
-    """The same block twice, toppled and spared."""
+    """Ask for two equal blocks, one toppled and one spared: no record is reached."""
     twice = rk.Block(np.full(2, ALPHA), np.full(2, P), 0.9)
     result = rk.inverse.find_record(twice, START, ["topple", "spare"], starts=2, **LINEAR)
     assert bool(result.status == rk.inverse.RecordStatus.not_reached) and jnp.isinf(result.change)

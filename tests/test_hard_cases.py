@@ -70,7 +70,7 @@ def model_and_engine(scene):
 
 
 def history(scene, loose=False):
-    """What a history tells, as arrays, with the impacts alone."""
+    """Return the data of a history as arrays, with the impacts alone."""
     scene = jax.tree.map(lambda x: np.asarray(x, float), scene)
     found = jax.device_get(_impacts(scene) if loose else _history(*model_and_engine(scene), scene))
     happened = np.isfinite(found["impact_times"])
@@ -264,7 +264,7 @@ def _used_up(steps):
 
 @pytest.mark.parametrize("steps", [40, 43])
 def test_a_history_ends_where_its_steps_are_used_up(steps):
-    """What was followed is there, and beyond it are no numbers; whether it ends with a stride of steps, or within."""
+    """Check that a history is NaN beyond the steps it took, whether it ends with a stride of steps or within one."""
     cut, last, times, states, forces = _used_up(steps)
     assert cut.status == rk.Status.step_budget_exhausted
     last, times, states = jax.device_get((last, times, states))
@@ -323,7 +323,7 @@ def _pushed(e, push, lasts, delay, initial, duration):
 
 
 def pushed(**scenes):
-    """The same in batches of so many lanes, of which the last one is filled up, as arrays."""
+    """Return `_pushed` as arrays, computed in batches of a fixed number of lanes; the last batch is padded."""
     columns = [np.array(scenes[name], float) for name in ("e", "push", "lasts", "delay", "initial", "duration")]
     count = max(len(column) for column in columns if column.ndim)
     columns[4] = np.broadcast_to(columns[4], (count, 2)) if columns[4].ndim == 1 else columns[4]

@@ -634,7 +634,7 @@ FLEXIBLE = "rk.blocks.FlexibleBlock(1.0, 5.0, 1e9, 2500.0, 0.02, 2), {}"
 
 @functools.cache
 def by_itself(block):
-    """What a process says that computes in single precision, and that then gives wrong kinds of arguments."""
+    """Run a process that computes in single precision and then passes arguments of wrong types; return its output."""
     return subprocess.run(
         [sys.executable, "-c", SINGLE.replace("BLOCK", block) + WRONG_KINDS],
         cwd=Path(rk.__file__).parents[1],

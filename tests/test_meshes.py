@@ -256,7 +256,7 @@ def test_a_rounded_cut_rolls_as_its_prism_does():
 
 
 def test_a_cut_that_does_not_stand():
-    """Of a rock on legs the plane through the centre cuts none."""
+    """Check a rock on legs: the plane through the centre cuts no leg."""
     legs = [trimesh.creation.box((0.1, 0.1, 0.5)) for _ in range(4)]
     for leg, (x, y) in zip(legs, ((1, 1), (1, -1), (-1, 1), (-1, -1))):
         leg.apply_translation([0.4 * x, 0.4 * y, 0.25])

@@ -698,7 +698,7 @@ def powers():
 
 @pytest.mark.parametrize("power", EXPONENTS, ids=str)
 def test_powers(power):
-    """Of known exponents, and of a lane's own; NumPy is the judge."""
+    """Compare powers with NumPy, of constant exponents and of exponents of each lane."""
     with np.errstate(all="ignore"):
         np.testing.assert_allclose(powers()[power], np.power(BASES, OWN if power is None else power), rtol=3e-14)
 
@@ -769,7 +769,7 @@ PROGRAMS = {
 
 @pytest.mark.parametrize("name", PROGRAMS)
 def test_programs_in_plain_operations(name):
-    """What is known is computed, and loops of known turns are unrolled: the same numbers come out."""
+    """Check that constant folding and the unrolling of loops with a known number of turns change no number."""
     function, left = PROGRAMS[name]
     x = np.linspace(-1, 4, 9)
     program = plain_programs.plain(jax.make_jaxpr(jax.jit(function))(1.0))
@@ -834,7 +834,7 @@ def test_programs_have_names_of_their_own():
 
 
 class Damper(eqx.Module):
-    """Of docs/how_to/own_physics.md."""
+    """The model of docs/how_to/own_physics.md."""
 
     size: jax.Array
 

@@ -39,7 +39,7 @@ def _reached(way, dt, *given):
 
 
 def reached(way, *given):
-    """What is told of a piece, by one of the two ways, and where a block is at many times within it."""
+    """Return bounds of a piece by one of the two ways, and positions of the block at many times within it."""
     *numbers, dt = given
     return jax.device_get(_reached(way, dt, *numbers, RNG.integers(0, 38, COUNT).astype(np.int32)))
 

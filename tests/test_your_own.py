@@ -137,7 +137,7 @@ WHOLE = np.array([0, 3, -2, 3, -1, 0])  # times 0.1: the corners, about
 
 @pytest.mark.parametrize("kind", [jnp.int32, jnp.int64, jnp.uint8])
 def test_whole_numbers_are_numbers(kind):
-    """Of whatever kind they are, in a block, in a motion, in a record that was made so: as real ones."""
+    """Check that whole numbers of any type count as real ones: in a block, a motion, or a record made of them."""
 
     def answer(kind):
         signed = jnp.asarray(WHOLE, jnp.int8 if kind is jnp.uint8 else kind)

@@ -50,7 +50,7 @@ def by_quadrature(vertices):
 
 
 def by_counting(vertices, count=10_000_000):
-    """The same from random points, and its standard errors (of the last: roughly)."""
+    """Estimate the properties from random points, with standard errors (of the last: roughly)."""
     draw = np.random.default_rng(7)
     v = np.array(vertices)
     low, high = v.min(0), v.max(0)
@@ -99,7 +99,7 @@ def text(x):
 
 
 def entry(vertices):
-    """What is known of an outline, and its properties as numbers."""
+    """Return the entry of an outline: vertices, and properties as numbers."""
     fractions = exact(vertices)
     area, (cx, cy), polar = properties(fractions)
     right, left = support(fractions)

@@ -37,7 +37,7 @@ class Ground:
         return self.knots[piece + 1] - self.knots[piece] if piece < self.pieces else mpfr("inf")
 
     def shaking(self, piece, t):
-        """Of both parts: the motion, its piece and the time in it, t after knot `piece`; None where it is over."""
+        """Yield, for both parts, the motion, its piece and the time in it, t after knot `piece`; None after its end."""
         for part in self.parts:
             middle = (self.knots[piece] + self.knots[piece + 1]) / 2 if part and piece < self.pieces else None
             if middle is None or middle >= part[1][-1]:

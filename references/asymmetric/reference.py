@@ -86,7 +86,7 @@ def run(c, factors=(0,) * 8, **options):
 
 
 def quantities(block, out):
-    """What condition numbers are told of."""
+    """Return the quantities for which condition numbers are computed."""
     found = {}
     if not out.overturned:
         found["max_rotation"] = max(out.highest[s][0] for s in (1, -1))
@@ -113,7 +113,7 @@ def impact_friction(block):
 
 
 def told(out, base):
-    """What happened, as texts."""
+    """Return the events and results as texts."""
     return {
         "impacts_in_motion": out.impacts_in_motion,
         "impacts": [[text(t), text(v)] for t, v, _ in out.impacts[: min(out.impacts_in_motion, LISTED)]],

@@ -1,4 +1,4 @@
-"""The same block as a free rigid body in an inertial frame: no scalar rocking equation is used here.
+"""The asymmetric block as a free rigid body in an inertial frame, without any scalar rocking equation.
 
 Unknowns: centre of mass X, Y [m], rotation q (positive clockwise) and the force (FX, FY) on the corner it stands on.
 Mass 1. The corner i is at rho_i in the body; d = Rot(q) rho_i. At every point of time the 5 x 5 system

@@ -47,7 +47,7 @@ class Block:
 
 @dataclass
 class Result:
-    """What happened; `peaks`: outward turning points (time, rotation); `impacts`: (time, velocity, side) before."""
+    """Events and results; `peaks`: outward turns (time, rotation); `impacts`: (time, velocity, side) before."""
 
     impacts: list = field(default_factory=list)
     peaks: list = field(default_factory=list)
@@ -245,7 +245,7 @@ class Run:
             self.out.samples.append(entry)
 
     def sample_rest(self, start, until):
-        """The same for a block at rest."""
+        """Take the samples that fall into a rest."""
         while self.times and self.times[0] <= start + until:
             time, zero = self.times.pop(0), mpfr(0)
             entry = {"time": time, "rotation": zero, "velocity": zero}
