@@ -259,11 +259,9 @@ class AsymmetricBlock(Owner):
 
         **Arguments:**
 
-        - `mesh`: a `Rock`, which has its own `unit` and `tolerance`; or a mesh for `Rock.from_mesh`, with these as
-          there.
+        - `mesh`: a `Rock`, or a mesh for `Rock.from_mesh`; `unit`, `tolerance`: as there, of a mesh only.
         - `azimuth`: from the first axis towards the second [rad]; its direction is to the right (corner 1).
-        - `base`, `plane`: as in `Rock.section`. A base for which "narrow" and "wide" differ is rounded: a warning says
-          so.
+        - `base`, `plane`: as in `Rock.section`. It warns of a rounded base, for which "narrow" and "wide" differ.
         - `restitution`, `gravity`: as in `from_radii`.
 
         **Returns:** an `AsymmetricBlock`: rocking in the plane alone, without twisting, rolling sideways, or sliding.
