@@ -2,7 +2,7 @@
 
 There are as many unknowns as samples, and margins are neither convex nor continuous in them. The result is the smallest
 of the changes to which several starts lead, each about a local minimum. Each start is a direction of change: louder or
-softer, the path of an optimiser of optax, and against the slopes of the margins under nearby records.
+softer, the path of an optimiser of optax, and against the slopes of margins under nearby records.
 """
 
 from collections.abc import Sequence
@@ -32,16 +32,16 @@ from jaxrock.status import Enumeration, item
 
 Real = Float[Array, "..."]
 Target = str | ArrayLike | Sequence[str | float]
-_ROUNDS = 6  # of the search, each of which keeps the peaks of the spectrum that have grown in the one before
-_APPROACH = 40  # steps of the optimiser
-_NEARBY = 0.15  # root mean square of what is added to a record to start nearby, over the record's
+_ROUNDS = 6  # rounds of the search; each constrains the spectral peaks that grew in the preceding round
+_APPROACH = 40  # largest number of steps of the optimiser
+_NEARBY = 0.15  # root mean square of the perturbation that makes a nearby record, over that of the record
 _UNRELATED, _TURNED = 6, 0.7  # first starts; root mean square of the perturbation of the best direction in later starts
-_SIDES = {"topple": 1.0, "spare": -1.0}  # the margin is to be on or below that, or above
-_USELESS = 1e6  # [1/g] slope of a margin, from which on a record in the sixth digit decides
+_SIDES = {"topple": 1.0, "spare": -1.0}  # 1: the margin shall be at the target or below; -1: at it or above
+_USELESS = 1e6  # [1/g] slope of a margin above which the sixth digit of the record decides
 
 
 class RecordStatus(Enumeration):
-    """What became of a search for a record; `RecordStatus[found.status]` is the message."""
+    """Result code of a search for a record; `RecordStatus[found.status]` is the message."""
 
     successful = item(
         "The margins are as wanted. This record is the nearest of those that the starts led to (see `changes`); other "
@@ -105,7 +105,7 @@ class FoundRecord(AbstractTable):
 
 
 def _usual():
-    """Momentum, in steps of two hundredths of the record at first."""
+    """Return the default optimiser: momentum, whose first steps are two hundredths of the record."""
     import optax
 
     return optax.chain(optax.clip_by_global_norm(1.0), optax.sgd(0.02, momentum=0.9))
@@ -133,20 +133,20 @@ def find_record(
 
     **Arguments:**
 
-    - `block`: a `Block` or `AsymmetricBlock`, of scalars or of (blocks,) arrays: all of these at once.
+    - `block`: a `Block` or `AsymmetricBlock`, of scalars or of (blocks,) arrays. One record must satisfy all blocks.
     - `start`: the `Record` to change.
-    - `target`: "topple", "spare", or a margin, which a block above it approaches from above; one for all blocks, or a
-      list.
+    - `target`: "topple", "spare", or a margin; one for all blocks, or a list. A block above the margin approaches it
+      from above, any other from below.
     - `optimizer`: an `optax.GradientTransformation` that finds a first change by slopes of margins, in root mean
       squares of the record. None: momentum with clipped slopes. `penalty`: weight of the squared change beside the
-      margins there, 0 or more.
-    - `band`: frequencies between which the record may change [Hz]; None: at all.
+      margins in that search, 0 or more.
+    - `band`: frequencies between which the record may change [Hz]; None: all frequencies.
     - `baseline`: whether velocity and displacement of the ground at the end of the record stay as they are.
-    - `spectrum`: (periods,) of oscillators of 5 % damping whose peaks stay within 5 % [s], 10 steps of the record or
-      more; None: no such limit.
+    - `spectrum`: (periods,) [s] of oscillators of 5 % damping whose peak responses stay within 5 %, each period 10
+      time steps of the record or more; None: no such limit.
     - `starts`: number of directions in which the search starts, at least 1. First louder or softer, the optimiser,
       slopes here, and three slopes under nearby records. Later ones alternate between the neighbourhood of the best and
-      nearby records, drawn by `seed`. `steps`: for each, at most.
+      nearby records, drawn by `seed`. `steps`: largest number of steps for each start.
     - `model`, `engine`, `progress`: as in `estimate_motion`.
 
     **Returns:** a `FoundRecord`: the nearest record found; no search of this kind proves it the nearest of all.
@@ -175,7 +175,7 @@ def find_record(
         directions = _Directions(search, samples, optimizer, penalty, np.random.default_rng(seed))
         reached, nearest = _nearest(search, directions, starts, steps, bar)
         if best is not None and nearest is None:
-            break  # the last one stays, and its status says that the spectrum does not
+            break  # return the change of the preceding round; its status says that the spectrum changes
         lengths, best = reached, nearest
         more = None if kept is None or best is None else kept.kept_at(samples + best.change)
         if more is None:
@@ -185,7 +185,7 @@ def find_record(
 
 
 def _nearest(search: Search, directions: "_Directions", starts: int, steps: int, bar: Progress):
-    """The lengths to which all starts come, and what the shortest is of."""
+    """Search from all starts; return the length of the change that each found, and the shortest change."""
     found = []
     for number in range(starts):
         best = min(found, key=_length, default=None)
@@ -221,7 +221,7 @@ def _checked_band(band: tuple[float, float] | None) -> tuple[float, float] | Non
 
 
 def _site(block, start: Record, target, model: AbstractEquation, engine: AbstractEngine | None) -> Site:
-    """The blocks, each with the margin that is wanted of it, and on which side of that it is to come."""
+    """Return the blocks, with the target margin of each and the side of the target on which it shall end."""
     shape = np.broadcast_shapes(*(jnp.shape(leaf.value) for leaf in leaves_of(block) if leaf.declared.axes == 0))
     if len(shape) > 1:
         raise ValueError(f"Argument `block` must be one block or a list of them, but has shape {shape}.")
@@ -243,7 +243,7 @@ def _site(block, start: Record, target, model: AbstractEquation, engine: Abstrac
 
 
 class _Directions(NamedTuple):
-    """Directions of change by number."""
+    """Directions of change, by the number of the start."""
 
     search: Search
     samples: np.ndarray
@@ -252,9 +252,10 @@ class _Directions(NamedTuple):
     random: np.random.Generator
 
     def __call__(self, number: int, nearest: Found | None) -> np.ndarray:
-        """Return the directions in order: louder (or softer), the optimiser, slopes here, slopes under nearby records.
+        """Return the direction of a start: louder or softer, the optimiser, slopes here, slopes under nearby records.
 
-        Later ones alternate with perturbations of the best direction, where a nearer record is likelier than elsewhere.
+        Later starts alternate between nearby records and perturbations of the best direction, near which a nearer
+        record is likelier than elsewhere.
         """
         if number == 0:
             louder, softer = (
@@ -273,14 +274,14 @@ class _Directions(NamedTuple):
         return nearby * 0.0 if straight is None else straight
 
     def _noise(self) -> np.ndarray:
-        """A record like the one that is changed, with other phases."""
+        """Return noise with the amplitude spectrum of the record and random phases."""
         spectrum = np.fft.rfft(self.samples)
         turned = spectrum * np.exp(2j * np.pi * self.random.uniform(size=spectrum.size))
         noise = np.fft.irfft(turned, self.samples.size)
         return _NEARBY * self.search.size * noise / max(rms(noise), 1e-300)
 
     def _by_optimizer(self) -> np.ndarray:
-        """Where the optimiser comes to what is wanted, or where it ends; for changes in root mean squares."""
+        """Return the change at which the optimiser first satisfies the targets, or else its last; in scaled units."""
         import optax
 
         optimizer = optax.with_extra_args_support(self.optimizer or _usual())

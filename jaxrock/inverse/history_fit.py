@@ -1,8 +1,8 @@
-"""Fits to measured histories: the block and the motion that make a simulated rotation follow a measured one.
+"""Fit a block and a motion to a measured history, so that the simulated rotation follows the measured one.
 
-Least squares of SciPy from many starts, with exact derivatives of whole histories by all parameters. A wrong
-period puts a simulated history out of phase, and sums of squares have a minimum at every slip by a cycle: so the fit
-begins with a short window of the data and goes on with longer ones, each from where the one before has ended.
+SciPy's least squares starts from many points, with exact derivatives of whole histories by all parameters. A wrong
+period puts a simulated history out of phase, and the sum of squares has a minimum at every slip by a cycle. The fit
+therefore begins with a short window of the data. Longer windows follow, each starting from the preceding minimum.
 """
 
 from collections.abc import Sequence
@@ -27,12 +27,12 @@ from jaxrock.motions.motion import AbstractMotion
 from jaxrock.numerics.least_squares import Covariance, Minimum, Problem, Progression, covariance, least_squares
 from jaxrock.status import Enumeration, item
 
-_GROWTH = 1.6  # from window to window
-_WIDE = 0.25  # relative standard error, from which on straight lines in the parameters no longer describe the data
+_GROWTH = 1.6  # ratio of the lengths of consecutive windows
+_WIDE = 0.25  # relative standard error above which a linear model in the parameters no longer describes the data
 
 
 class HistoryStatus(Enumeration):
-    """What became of a fit to a history; `HistoryStatus[fit.status]` is the message."""
+    """Result code of a fit to a history; `HistoryStatus[fit.status]` is the message."""
 
     successful = item("A minimum of the sum of squares was found, and it tells every parameter.")
     not_identified = item(
@@ -46,20 +46,21 @@ class HistoryStatus(Enumeration):
 
 
 class HistoryFit(AbstractTable):
-    """What `fit_history` finds; parameters in the order of `names`.
+    """The result of `fit_history`; parameters are in the order of `names`.
 
     - `names`, `values`: of the parameters.
     - `covariance`: (parameters, parameters), for independent errors of the measurement.
-    - `robust_covariance`: the same for errors that last, correlated in time as residuals are: wider, if they are.
+    - `robust_covariance`: (parameters, parameters), for errors correlated in time as the residuals are; wider, if they
+      are correlated.
     - `scatter`: standard deviation of the measurement [rad]: as given (the root mean square, if there are many), or
       estimated from the residuals.
     - `residuals`: (n,) measured less fitted rotation [rad]; `rotation`: (n,) fitted [rad].
-    - `correlation`: of neighbouring residuals [-]; `correlated`: whether that is more than chance.
-    - `misfit`: root mean square of residuals over scatter, counted by degrees of freedom; near 1 for a good model, and
+    - `correlation`: of neighbouring residuals [-]; `correlated`: whether it is more than chance.
+    - `misfit`: root mean square of residuals over scatter, by degrees of freedom. It is near 1 for a good model, and
       exactly 1 where the scatter was estimated.
-    - `agreement`: share of the starts that came to this minimum.
-    - `block`, `motion`, `initial`: the fitted scene, for `simulate`. The motion rests if there was none.
-    - `status`: a `HistoryStatus`; `warnings`: in words, what to beware of. Empty if there is nothing.
+    - `agreement`: share of the starts that reached this minimum.
+    - `block`, `motion`, `initial`: the fitted scene, for `simulate`. The motion is at rest if none was given.
+    - `status`: a `HistoryStatus`; `warnings`: cautions about the result, in words; empty if there are none.
     """
 
     names: tuple[str, ...] = eqx.field(static=True)
@@ -80,19 +81,19 @@ class HistoryFit(AbstractTable):
     warnings: tuple[str, ...] = eqx.field(static=True)
 
     def __getitem__(self, name: str) -> float:
-        """The estimate of a parameter."""
+        """Return the estimate of a parameter."""
         if name not in self.names:
             raise KeyError(f"{name!r} is not one of the parameters {', '.join(self.names)}.")
         return float(self.values[self.names.index(name)])
 
     @called_by_users
     def intervals(self, confidence: float = 0.95, robust: bool | None = None) -> Float[np.ndarray, "parameters 2"]:
-        """Confidence intervals, each of one parameter by itself.
+        """Return confidence intervals, each for one parameter by itself.
 
         **Arguments:**
 
         - `confidence`: in (0, 1).
-        - `robust`: whether by `robust_covariance`; None: where residuals are correlated.
+        - `robust`: whether to use `robust_covariance`; None: use it if residuals are correlated.
 
         **Returns:** (parameters, 2) lower and upper ends.
 
@@ -144,24 +145,27 @@ def fit_history(
 
     **Arguments:**
 
-    - `time`: (n,) of the measurements from the start of the motion [s], 0 or more and rising.
+    - `time`: (n,) times of the measurements from the start of the motion [s], 0 or more and rising.
     - `rotation`: (n,) measured [rad].
-    - `block`, `motion`: where to start, and what is not fitted; a motion of None rests (free rocking).
+    - `block`, `motion`: starting values of fitted parameters, and values of all others; a motion of None is free
+      rocking.
     - `model`: as in `outcome`.
-    - `parameters`: names of what is fitted: "alpha", "p", "restitution" (of an asymmetric block "alpha1", "alpha2",
-      "p1", "inertia_ratio", "radius_ratio", "restitution1", "restitution2"; of a law of restitution with parameters
-      these, as "restitution.gentle"); those of the motion ("amplitude" [g] also
-      of a record, whose peak it is); "initial" [rad] and "velocity" [rad/s] at time 0; and of the measurement its
-      "delay" [s] behind the motion (before it, the block is as it was at time 0) and its "offset" [rad]. None: angles,
-      frequency parameter and restitutions of the block, and "initial".
+    - `parameters`: names of the fitted parameters. None: angles, frequency parameter and restitutions of the block, and
+      "initial". Names are:
+        - of a block "alpha", "p", "restitution"; of an asymmetric block "alpha1", "alpha2", "p1", "inertia_ratio",
+          "radius_ratio", "restitution1", "restitution2"; those of a law of restitution, as "restitution.gentle";
+        - those of the motion ("amplitude" [g] also of a record: its peak);
+        - "initial" [rad] and "velocity" [rad/s] at time 0;
+        - of the measurement its "delay" [s] behind the motion (until then, the block keeps its state at time 0) and its
+          "offset" [rad].
     - `initial`: rotation [rad] and angular velocity [rad/s] at time 0, to start from. None: (0, 0) under a motion, the
       first measured rotation without.
     - `scatter`: standard deviation of the errors of measurement [rad], one number or (n,); None: from the residuals.
-    - `spread`: how far off the starting values may be, relative; starts are scattered by that much.
-    - `starts`: how many, at least 1; the first is what is given. `seed`: of the others.
+    - `spread`: relative uncertainty of the starting values, by which starts are scattered.
+    - `starts`: number of starts, at least 1; the first has the given values. `seed`: seed of the others.
     - `engine`: as in `outcome`; None: series of order 8 to a tolerance of 1e-10, ample for data.
 
-    **Returns:** a `HistoryFit`. Restitution that is not fitted follows the angles if it is not given.
+    **Returns:** a `HistoryFit`. A restitution that is neither fitted nor given follows the angles.
 
     **Raises:** ValueError for arguments outside their ranges, or names that the scene does not have.
 
@@ -175,7 +179,7 @@ def fit_history(
     places = np.arange(time.size)
 
     def at(point: np.ndarray, samples: int):
-        """Weighted residuals and their derivatives in a window of the data."""
+        """Return weighted residuals and their derivatives in a window of the data."""
         fitted, slopes, known = map(np.asarray, history(jnp.asarray(point), time, time[samples - 1], scene))
         inside = np.where(places < samples, weight, 0.0)
         residuals = np.where(inside > 0, (rotation - fitted) * inside, 0.0)
@@ -192,7 +196,7 @@ def fit_history(
 
 
 def _data(time: Values, rotation: Values, scatter: Values | None, least: int):
-    """Times, rotations and weights of the measurements as arrays of one length."""
+    """Check the measurements; return times, rotations and weights as arrays of one length."""
     time = np.asarray(not_negative("time", time))
     rotation = np.asarray(finite("rotation", rotation))
     if time.ndim != 1 or time.size <= least:
@@ -208,7 +212,7 @@ def _data(time: Values, rotation: Values, scatter: Values | None, least: int):
 
 
 def _windows(size: int, count: int) -> tuple[int, ...]:
-    """Numbers of samples of the windows, growing to all."""
+    """Return the numbers of samples in the windows; the last window holds all."""
     windows = [size]
     while windows[0] / _GROWTH > max(4 * count, size / 40):
         windows.insert(0, int(windows[0] / _GROWTH))
@@ -216,17 +220,17 @@ def _windows(size: int, count: int) -> tuple[int, ...]:
 
 
 def _noise(rotation: np.ndarray) -> float:
-    """Size of errors, from second differences, in which a smooth history all but vanishes."""
+    """Estimate the size of errors from second differences, in which a smooth history nearly vanishes."""
     size = float(np.median(np.abs(np.diff(rotation, 2))) / (0.6745 * np.sqrt(6)))
     return max(size, 1e-7 * float(np.max(np.abs(rotation))), 1e-300)
 
 
 def _fit(scene: FittedScene, minimum: Minimum, spread: Covariance, problem, rotation, weight, scatter) -> HistoryFit:
-    """The result in the units of the data, with what there is to warn of."""
+    """Return the result in the units of the data, with its warnings."""
     size = rotation.size
     simulated = bool(np.isfinite(minimum.residuals).all())
-    # Of independent residuals the correlation of neighbours has the standard deviation size^(-1/2); of a perfect fit
-    # the residuals are the rounding of the engine, which means nothing.
+    # For independent residuals the correlation of neighbours has the standard deviation size^(-1/2). Residuals of a
+    # perfect fit are rounding errors of the engine, whose correlation means nothing.
     real = simulated and np.max(np.abs(minimum.residuals / weight)) > 1e-7 * np.max(np.abs(rotation))
     correlated = real and spread.correlation > max(3 / np.sqrt(size), 0.1)
     values = np.asarray(scene.values(minimum.point))
@@ -258,7 +262,7 @@ def _fit(scene: FittedScene, minimum: Minimum, spread: Covariance, problem, rota
 
 
 def _judged(scene: FittedScene, minimum: Minimum, spread: Covariance, problem: Problem, correlated, scatter):
-    """Status, and warnings in words."""
+    """Return the status, and warnings in words."""
     size, count = minimum.residuals.size, minimum.point.size
     warnings = []
     used = spread.robust if correlated else spread.independent
@@ -286,6 +290,6 @@ def _judged(scene: FittedScene, minimum: Minimum, spread: Covariance, problem: P
     for name, near in zip(scene.names, margin < np.sqrt(np.diag(used))):
         if near:
             warnings.append(f"`{name}` is at its bound to within its standard error: its interval reaches beyond.")
-    # Along what is not told a minimum is never reached.
+    # No minimum is reached along a direction that the data do not determine, so that status takes precedence.
     status = HistoryStatus.successful if minimum.converged else HistoryStatus.not_converged
     return status if identified else HistoryStatus.not_identified, warnings

@@ -1,4 +1,4 @@
-"""What a fit to a measured history simulates: the scene, and the coordinates in which its parameters are fitted."""
+"""The scene that a fit to a measured history simulates, and the coordinates in which its parameters are fitted."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -32,7 +32,7 @@ _SHAPE: dict[type, tuple[str, ...]] = {Block: ("alpha", "p"), AsymmetricBlock: (
 
 
 class FittedScene(eqx.Module):
-    """Block, motion and measurement as they are simulated, and the `names` of those parameters that are fitted."""
+    """Block, motion and measurement as simulated, and the `names` of the fitted parameters."""
 
     names: tuple[str, ...] = eqx.field(static=True)
     block: Block | AsymmetricBlock
@@ -43,7 +43,7 @@ class FittedScene(eqx.Module):
 
     @classmethod
     def of(cls, block, motion, model, parameters, initial, rotation, engine) -> "FittedScene":
-        """Check the names, and fill in what was left open."""
+        """Check the names, and fill in the defaults."""
         still = RectangularPulse(0.0, 1.0)
         check_single(block=block, motion=still if motion is None else motion)
         free, motion = motion is None, still if motion is None else motion
@@ -67,13 +67,16 @@ class FittedScene(eqx.Module):
 
     @property
     def logarithmic(self) -> np.ndarray:
-        """Which parameters are fitted by their logarithms."""
+        """A truth value for each parameter: whether it is fitted by its logarithm."""
         return self._ends[:, 0] == 0
 
     @property
     def _ends(self) -> np.ndarray:
-        """Open intervals that parameters stay in. Those that begin at zero are fitted by their logarithms: combinations
-        that data do not tell apart are products of powers."""
+        """Open intervals of the parameters, (parameters, 2).
+
+        Parameters whose interval begins at zero are fitted by their logarithms, because combinations that data do not
+        distinguish are products of powers.
+        """
         known = {name: (one.range.low, one.range.high) for name, one in self._declared.items()}
         known |= {"initial": (-np.pi / 2, np.pi / 2)}
         return np.array([known.get(name, (-np.inf, np.inf)) for name in self.names])
@@ -83,14 +86,14 @@ class FittedScene(eqx.Module):
         return declarations(self.block, self.motion)
 
     def _natural_size(self, name: str, value: float) -> float:
-        """Natural size of a parameter: its value, but of angles and numbers that may be zero."""
+        """Return the natural size of a parameter: its value; 1 for angles and numbers that may be negative."""
         known = self._declared.get(name)
         if known is not None and known.axes is not None and known.unit in ("-", "rad") and known.range.low < 0:
             return 1.0
         return abs(value) or 1.0
 
     def coordinates(self) -> tuple[np.ndarray, ...]:
-        """Where the fit starts, natural sizes of its coordinates, and lower and upper ends of their open intervals."""
+        """Return the start of the fit, natural sizes of its coordinates, and both ends of their open intervals."""
         alpha, p = map(float, _size(self.block))
         sizes = {"initial": alpha, "velocity": alpha * p, "delay": 1 / p, "offset": alpha}
         known = named(self.block, self.motion) | dict(zip(("initial", "velocity"), self.initial))
@@ -103,23 +106,23 @@ class FittedScene(eqx.Module):
         return values, np.where(self.logarithmic, 1.0, scale), *bounds
 
     def values(self, point):
-        """Parameters from coordinates."""
+        """Return the parameters at coordinates."""
         return jnp.where(self.logarithmic, jnp.exp(jnp.where(self.logarithmic, point, 0.0)), point)
 
     @property
     def _reach(self) -> Array:
-        """How far the measurement may be delayed [s]; further it would be better shifted by hand."""
+        """Largest |delay| of the measurement [s]; the user should shift data by more than that before the fit."""
         return 2 / _size(self.block)[1]
 
     def at(self, values: dict) -> tuple[Any, AbstractMotion, tuple]:
-        """Block, motion and initial state with other parameters."""
+        """Return block, motion and initial state with other parameters."""
         before = named(self.block, self.motion)
         after = {name: values.get(name, x) for name, x in before.items()}
         block, motion = rebuilt(self.block, self.motion, after, before["amplitude"])
         return block, motion, (values.get("initial", self.initial[0]), values.get("velocity", self.initial[1]))
 
     def rotation(self, point, time, until):
-        """Rotation at times up to `until`, and whether the block could be followed."""
+        """Return the rotation at times up to `until`, and whether the engine computed the response."""
         values = dict(zip(self.names, self.values(point)))
         duration = until + (self._reach if "delay" in self.names else 0.0)
         with put_down() as checks:
@@ -128,7 +131,7 @@ class FittedScene(eqx.Module):
                 block, motion, self.model, initial=initial, duration=duration, engine=self.engine, samples=2
             )
             rotation, _ = response(jnp.clip(time - values.get("delay", 0.0), 0.0, duration))
-        # A verdict that is too close to call is about what comes after the data.
+        # A verdict that is too close to call concerns the time after the data.
         known = (response.status == Status.successful) | (response.status == Status.undecided)
         for _, failed in checks:
             known &= ~failed
@@ -136,14 +139,14 @@ class FittedScene(eqx.Module):
 
 
 def _size(block: Block | AsymmetricBlock) -> tuple[Array, Array]:
-    """Slenderness angle, of the weaker side, and frequency parameter."""
+    """Return the slenderness angle, that of the weaker side, and the frequency parameter."""
     if isinstance(block, Block):
         return block.alpha, block.p
     return jnp.minimum(block.alpha1, block.alpha2), block.p1
 
 
 def _given(block: Block | AsymmetricBlock, names: Sequence[str]) -> Block | AsymmetricBlock:
-    """The block with values of its own for what is fitted, and no longer follows from the rest."""
+    """Return the block with explicit values for fitted parameters that would otherwise follow from others."""
     if isinstance(block, Block):
         return Block(block.alpha, block.p, block.restitution) if "restitution" in names else block
     radii = block.radius_ratio if "radius_ratio" in names else block.given_radius_ratio
@@ -154,7 +157,7 @@ def _given(block: Block | AsymmetricBlock, names: Sequence[str]) -> Block | Asym
 
 @quickly(follows_scenes=True)
 def history(point, time, until, scene: FittedScene):
-    """Of one point: rotations, their derivatives by the coordinates, and whether there is a history."""
+    """Return the rotations at one point, their derivatives by the coordinates, and whether all are known and finite."""
 
     def value_twice(point):
         rotation, known = scene.rotation(point, time, until)

@@ -1,7 +1,8 @@
-"""Response spectra that a change of a record leaves as they are: what an oscillator does at an instant is linear in it.
+"""Linear constraints on a change of a record that preserve its response spectrum at given periods.
 
-So a change that adds nothing to any of their responses at the instants of their peaks leaves the peaks; where it makes
-a higher one at another instant, that instant is kept, too, and the search goes on.
+The response of an oscillator at an instant is linear in the record. A change that adds nothing to the response at the
+instant of its peak preserves that peak. Where the change makes a higher peak at another instant, that instant becomes
+a further constraint, and the search continues.
 """
 
 from typing import NamedTuple
@@ -9,16 +10,16 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-DAMPING = 0.05  # over critical, as usual
-TOLERANCE = 0.05  # by which a spectrum may change
-_HIGH = 0.85  # of a peak; instants whose response is as high are kept from the beginning
+DAMPING = 0.05  # share of critical damping, the usual value
+TOLERANCE = 0.05  # largest relative change of a spectrum
+_HIGH = 0.85  # share of the highest peak; all peaks at least as high are constrained from the beginning
 
 
 class KeptSpectrum(NamedTuple):
-    """Oscillators under a record of `samples` (n,) [g], whose peaks are to stay; rows, (rows, n), whose products with a
-    change vanish.
+    """Oscillators under a record of `samples` (n,) [g], whose peak responses shall be preserved.
 
-    They are looked at at the samples, and for a period after them.
+    An allowed change has a product of zero with every row of `rows`, (rows, n). Responses are evaluated at the samples,
+    and for one period after them.
     """
 
     period: Float[np.ndarray, " periods"]
@@ -28,7 +29,7 @@ class KeptSpectrum(NamedTuple):
 
     @classmethod
     def of(cls, period: np.ndarray, samples: np.ndarray, dt: float) -> "KeptSpectrum":
-        """With rows for the peaks of the record as it is."""
+        """Return constraints with rows for the peaks under the given record."""
         bare = cls(period, samples, dt, np.zeros((0, samples.size)))
         rows = []
         for each in period:
@@ -39,7 +40,7 @@ class KeptSpectrum(NamedTuple):
         return bare._replace(rows=np.stack(rows))
 
     def displacement(self, period: float, samples: np.ndarray) -> np.ndarray:
-        """Of an oscillator relative to the ground, over that of a slow load, at all instants."""
+        """Return the displacement of an oscillator relative to the ground, over the static one, at all instants."""
         from scipy.signal import lfilter
 
         s, first, second = self._lines(period)
@@ -48,7 +49,7 @@ class KeptSpectrum(NamedTuple):
         return -np.asarray(lfilter([1.0], [1.0, -np.exp(s * self.dt)], gain)).imag * abs(s) ** 2 / s.imag
 
     def row(self, period: float, instant: int) -> np.ndarray:
-        """How the displacement at an instant follows from all samples, as a vector of length 1."""
+        """Return the coefficients of the displacement at an instant by all samples, as a vector of length 1."""
         s, first, second = self._lines(period)
         later = instant - np.arange(self.samples.size)
         row = np.zeros(self.samples.size, complex)
@@ -58,23 +59,23 @@ class KeptSpectrum(NamedTuple):
         return row.imag / np.linalg.norm(row.imag)
 
     def _lines(self, period: float) -> tuple[complex, complex, complex]:
-        """The exponent of an oscillator, and what the sample before and after a line adds at its end."""
+        """Return the exponent of an oscillator, and the contributions of both samples of a line at the line's end."""
         s = 2 * np.pi / period * complex(-DAMPING, np.sqrt(1 - DAMPING**2))
         x = s * self.dt
         whole, end = np.expm1(x) / s, (np.expm1(x) / x - 1) / s
         return s, whole - end, end
 
     def change(self, samples: np.ndarray) -> float:
-        """By which share the spectrum of other samples differs at most from that of the record."""
+        """Return the largest relative difference between the spectrum of other samples and that of the record."""
         return max(abs(self._growth(each, samples)[0]) for each in self.period)
 
     def _growth(self, period: float, samples: np.ndarray) -> tuple[float, int]:
-        """By which share a peak grows, and where it is then."""
+        """Return the relative growth of the peak of an oscillator under other samples, and the instant of that peak."""
         size = np.abs(self.displacement(period, samples))
         return size.max() / np.abs(self.displacement(period, self.samples)).max() - 1, int(np.argmax(size))
 
     def kept_at(self, samples: np.ndarray) -> "KeptSpectrum | None":
-        """With rows for the peaks that have grown under other samples; None where none has, by more than is allowed."""
+        """Return constraints with further rows for peaks that grow by more than the tolerance; None if none does."""
         grown = [(each, *self._growth(each, samples)) for each in self.period]
         more = [self.row(each, instant) for each, growth, instant in grown if growth > TOLERANCE]
         return self._replace(rows=np.concatenate([self.rows, np.stack(more)])) if more else None

@@ -2,7 +2,7 @@
 
 A known block under a known motion stands or falls by the sign of its margin. Neither is known. The motion at each rock
 differs from that of the site by a lognormal factor. `scatter` is its standard deviation in ln amplitude: variation of
-the ground, and errors of the model of a rigid block in a plane. The parameters alpha, p and restitution are uncertain
+the ground, and errors of the model of a rigid block in a plane. The parameters alpha, p and restitution are uncertain,
 too. The probability that a rock stands is the share of these possible scenes with a positive margin:
 
     P(stands) = E[margin > 0],  over  ln amplitude + scatter e0,  ln alpha + (alpha_sd/alpha) e1,  ln p + (p_sd/p) e2,
@@ -50,8 +50,8 @@ Real = Inexact[Array, "..."]
 Flags = Bool[Array, "..."]
 _Found = tuple[Real, Flags, Flags]  # margin and rotation, overturned, known
 _NO_STRENGTH = 1e-30  # [g]
-_DRAWS = 8  # quadratures from which its error is estimated
-_FLAT = -np.log(np.pi / 2)  # log-density of a rotation of which nothing is known but that the rock stands
+_DRAWS = 8  # random quadratures from which the error of the quadrature is estimated
+_FLAT = -np.log(np.pi / 2)  # log-density of a rotation in (0, pi/2) if only the survival of the rock is known
 
 
 def quadrature_accuracy(name: str, value: Any) -> float:
@@ -121,9 +121,9 @@ class Likelihood(eqx.Module):
         return self.observations.ways.size * self.quadrature.scenes
 
     def current(self, names: Sequence[str]) -> "Likelihood":
-        """The same with motion and model as they are now, for parameters of such names: a pytree for `jax.jit`.
+        """Return a pytree for `jax.jit`, with the current state of motion and model, for parameters of such names.
 
-        **Raises:** ValueError where the motion is not made of these.
+        **Raises:** ValueError where the function of the motion does not take these names.
         """
         _check_names(self.motion, names)
         seen, number = self.observations, jax.ShapeDtypeStruct((), jnp.result_type(float))
@@ -132,31 +132,30 @@ class Likelihood(eqx.Module):
 
     @called_by_users
     def log_terms(self, values: Mapping[str, ArrayLike], slopes: bool = True) -> Real:
-        """Log-likelihood of each rock, (..., rocks), for `values` (...) of the motion's parameters by name.
+        """Return the log-likelihood of each rock, (..., rocks), for `values` (...) of the motion's parameters by name.
 
-        For a rock that survived or toppled the logarithm of a probability, for a measured rotation that of a density
-        [1/rad]; minus infinity for motions that there are not, such as those of a negative duration. It has derivatives
-        if `slopes`, and is computed faster without. Many motions at once take less time than `jax.vmap` of one.
-        """
+        It is the logarithm of a probability, or of a density [1/rad] for a measured rotation; minus infinity for
+        impossible motions, such as those of negative duration. It has derivatives if `slopes`, and is faster without.
+        One call for many motions takes less time than `jax.vmap` of calls for one."""
         return self._compiled(Likelihood.terms, values, slopes)
 
     def terms(self, values: Mapping[str, ArrayLike], slopes: bool = True, wanted: Flags | None = None) -> Real:
-        """What `log_terms` returns, within a program; of motions that are not `wanted`, (...), nothing is computed."""
+        """Return the result of `log_terms`, within a traced program; skip motions that are not `wanted`, (...)."""
         possible, impossible = self._possible(values, slopes, wanted)
         return self._terms(self._log_probabilities(possible), impossible)
 
     def _compiled(self, what: Callable, values: Mapping[str, ArrayLike], *how):
-        """One of its functions as one program: outside of a program every operation would be one of its own."""
+        """Run a method as one compiled program; uncompiled, JAX would dispatch each operation separately."""
         given = {name: as_real(name, x) for name, x in values.items()}
         check_shapes(**given)
         return as_program(what, self.current(tuple(values)), given, *how)
 
     def _log_probabilities(self, possible: Possible) -> Real:
-        """Of standing and toppling, and of standing as it was measured; without the possibility of a lapse."""
+        """Return log-probabilities, without lapse, of standing, toppling, and standing with the measured rotation."""
         seen = self.observations
         variance = possible.rotation_width**2 + seen.rotation_sd**2
         density = -((seen.rotation - possible.rotation) ** 2) / (2 * variance) - jnp.log(2 * jnp.pi * variance) / 2
-        # Of a rotation in a scene that was not computed nothing is known.
+        # The rotation in a scene that was not computed is unknown: use the flat density.
         density = jnp.where(possible.known, density, _FLAT)
         ends = jnp.full_like(density[:1], _FLAT)
         return possible.log_probabilities(jnp.where(seen.seen == ROTATION, jnp.concatenate([ends, density, ends]), 0.0))
@@ -169,12 +168,12 @@ class Likelihood(eqx.Module):
         return jnp.where(impossible[..., None], -jnp.inf, terms)
 
     def _or_lapse(self, log_probability: Real, flat: Real | float = 0.0) -> Real:
-        """With the possibility that the observation says nothing: then it is as likely that a rock stands as not."""
+        """Mix in the probability of a lapse, under which standing and toppling are equally likely."""
         return jnp.logaddexp(jnp.log1p(-self.lapse) + log_probability, jnp.log(self.lapse / 2) + flat)
 
     @called_by_users
     def survival(self, values: Mapping[str, ArrayLike]) -> Real:
-        """Probability that each rock stands, (..., rocks), without derivatives."""
+        """Return the probability that each rock stands, (..., rocks), without derivatives."""
         return self._compiled(Likelihood._survival, values)
 
     @called_by_users
@@ -187,7 +186,7 @@ class Likelihood(eqx.Module):
 
     @called_by_users
     def drawn(self) -> list["Likelihood"]:
-        """Return likelihoods by other quadratures with as many nodes at random places; they scatter by their errors."""
+        """Return likelihoods by random quadratures with as many nodes; their scatter estimates the error."""
         draws = (self.quadrature.drawn(seed) for seed in range(_DRAWS))
         return [eqx.tree_at(lambda it: it.quadrature, self, each) for each in draws]
 
@@ -196,10 +195,10 @@ class Likelihood(eqx.Module):
 
     @called_by_users
     def surprise(self, values: Mapping[str, ArrayLike]) -> tuple[Real, Real, Real]:
-        """For each rock: how badly it fits, what one expects of that, and with which variance; (..., rocks) each.
+        """Return the badness of fit of each rock, its expectation and its variance, (..., rocks) each; no derivatives.
 
-        The badness is minus the log-probability; for a measured rotation half its squared distance from what is
-        expected, in standard deviations, and minus the log-probability that it stands. Without derivatives.
+        The badness is minus the log-probability of the outcome. For a measured rotation, half its squared distance from
+        the expected rotation, in standard deviations, is added to minus the log-probability that the rock stands.
         """
         return self._compiled(Likelihood._surprise_at, values)
 
@@ -210,8 +209,9 @@ class Likelihood(eqx.Module):
     def terms_and_facts(
         self, values: Mapping[str, ArrayLike], wanted: Flags | None = None
     ) -> tuple[Real, tuple[Real, Real, Real, Real, Real]]:
-        """What `log_terms`, and `survival`, the share of scenes that were computed, and `surprise` return; for the cost
-        of the first. Within a program; of motions that are not `wanted`, (...), nothing is computed."""
+        """Return `log_terms`, and `survival`, the share of computed scenes and `surprise`, at the cost of the first.
+
+        For use within a traced program; motions that are not `wanted`, (...), are skipped."""
         possible, impossible = self._possible(values, True, wanted)
         logarithms = self._log_probabilities(possible)
         facts = jnp.exp(logarithms[0]), possible.share_known, *self._surprise(possible, logarithms)
@@ -224,7 +224,7 @@ class Likelihood(eqx.Module):
         badness = jnp.where(seen.seen == TOPPLED, -topples, -stands)
         mean, variance = -(share * stands + lost * topples), share * lost * (stands - topples) ** 2
 
-        # The rotation to be expected of a rock that stands.
+        # The expected rotation of a rock that stands.
         weight = jnp.where(possible.known, possible.weight * ndtr(possible.y / possible.width), 0.0)
         weight = weight / possible.y.shape[-2]
         total = jnp.maximum(jnp.sum(weight, axis=(0, -2)), 1e-9)
@@ -237,8 +237,8 @@ class Likelihood(eqx.Module):
     def _possible(
         self, values: Mapping[str, ArrayLike], slopes: bool = False, wanted: Flags | None = None
     ) -> tuple[Possible, Flags]:
-        """What becomes of every rock in every possible scene, with first derivatives, if `slopes`; and whether there is
-        no such motion, or none that is `wanted`."""
+        """Return outcomes in all possible scenes, with first derivatives if `slopes`; and which motions are impossible,
+        or not `wanted`."""
         seen, names = self.observations, tuple(values)
         parameters = jnp.stack(jnp.broadcast_arrays(*(as_real(name, x) for name, x in values.items())), axis=-1)
         if not slopes:
@@ -247,7 +247,7 @@ class Likelihood(eqx.Module):
         strength, impossible = jax.vmap(lambda x: self._strength(names, x))(parameters.reshape(-1, len(names)))
         strength, impossible = strength.reshape(outer), impossible.reshape(outer)
         levels, where = levels_around(seen, self.quadrature, self.scatter, strength)
-        if wanted is not None:  # a scene of no strength that is a number ends at once
+        if wanted is not None:  # a scene whose strength is NaN ends at once
             levels = levels._replace(strength=jnp.where(wanted[..., None, None], levels.strength, jnp.nan))
             impossible |= ~wanted
         shape = (*levels.strength.shape[:-1], *seen.ways.shape)  # (nodes, ..., possible, ways, rocks)
@@ -259,7 +259,7 @@ class Likelihood(eqx.Module):
         parameters = parameters.reshape(-1, len(names))
         blocks = jax.tree.map(lanes, seen.blocks_at(levels.alpha, levels.p, levels.restitution))
         ways = jnp.broadcast_to(seen.ways, shape).ravel()
-        # Values whose derivatives are known: JAX has to go through this product only, and not through the engine.
+        # `_sloping` attaches known derivatives: JAX differentiates that product only, and not the engine.
         scene = _Scene(self.motion, self.model, self.engine, names)
         fixed, level = jax.lax.stop_gradient((parameters, lanes(levels.strength)))
         if slopes:
@@ -277,7 +277,7 @@ class Likelihood(eqx.Module):
         return Possible.of(where, margin, rotation, known, lost, verge, self.quadrature.apart), impossible
 
     def _strength(self, names: tuple[str, ...], parameters: Real) -> tuple[Real, Bool[Array, ""]]:
-        """Logarithm of the strength of a motion, and whether there is no such motion."""
+        """Return the logarithm of the strength of a motion, and whether the motion is impossible."""
         with put_down() as checks:
             strength = _log_strength(_made(self.motion(**dict(zip(names, parameters)))))
         failed = jnp.stack([~jnp.isfinite(strength), *(bad for _, bad in checks)]).any()
@@ -285,14 +285,14 @@ class Likelihood(eqx.Module):
 
 
 def _check_names(motion: Callable, names: Sequence[str]) -> None:
-    """Raise ValueError where a motion is not made of parameters of such names."""
+    """Raise ValueError where the function of the motion does not take parameters of such names."""
     if not names:
         raise ValueError("Argument `values` must name the parameters of the motion, but is empty.")
     if isinstance(motion, UserFunction):
-        return  # it has been traced for its names
+        return  # tracing has already checked its names
     try:
         signature = inspect.signature(motion.function if isinstance(motion, ByIdentity) else motion)
-    except ValueError:  # of some functions that are not Python's
+    except ValueError:  # some functions that are not written in Python have no signature
         return
     try:
         signature.bind(**dict.fromkeys(names))
@@ -301,7 +301,7 @@ def _check_names(motion: Callable, names: Sequence[str]) -> None:
 
 
 def _made(motion: Any) -> AbstractMotion:
-    """What the motion's function has made, if that is one."""
+    """Return the result of the motion's function; raise ValueError unless it is a motion."""
     if not isinstance(motion, AbstractMotion):
         is_array = isinstance(motion, (jax.Array, np.ndarray))
         what = f"an array of shape {motion.shape}" if is_array else shown(motion)
@@ -311,19 +311,19 @@ def _made(motion: Any) -> AbstractMotion:
 
 @quickly(eqx.filter_jit, follows_scenes=True)
 def as_program(what: Callable, likelihood: Likelihood, values: Mapping[str, ArrayLike], *how):
-    """A function of a likelihood as it is now (`current`), at values by name, as one compiled program."""
+    """Run a function of a `current` likelihood, at values by name, as one compiled program."""
     return what(likelihood, values, *how)
 
 
 def _log_strength(motion: AbstractMotion) -> Real:
-    """Logarithm of a measure of the acceleration: any that grows with it will do."""
+    """Return the logarithm of a measure of the acceleration; any measure that grows with it serves."""
     return jnp.log(jnp.maximum(jnp.max(motion.bounds), _NO_STRENGTH))
 
 
 def _of_strength(motion: AbstractMotion, logarithm: Real, way: Real) -> AbstractMotion:
-    """The motion made so strong, one way or (-1) the other.
+    """Return the motion scaled to a strength, with the sign `way` (1 or -1).
 
-    The amplitude of a pulse, which would cancel, is left out, so that nothing is differentiated by it.
+    The amplitude of a pulse would cancel; only its sign is kept, so that no derivative by it is computed.
     """
     if isinstance(motion, AbstractPulse):
         motion = eqx.tree_at(lambda pulse: pulse.amplitude, motion, jnp.sign(motion.amplitude))
@@ -331,7 +331,7 @@ def _of_strength(motion: AbstractMotion, logarithm: Real, way: Real) -> Abstract
 
 
 class _Scene(eqx.Module):
-    """What becomes of one rock in one possible scene."""
+    """Computes the outcome of one rock in one possible scene."""
 
     motion: Callable[..., AbstractMotion]
     model: AbstractEquation
@@ -339,8 +339,8 @@ class _Scene(eqx.Module):
     names: tuple[str, ...] = eqx.field(static=True)
 
     def results(self, parameters: Real, level: Real, way: Real, block) -> tuple[Real, _Found]:
-        """Margin and rotation; and these again, whether it overturned, and whether that is known."""
-        with put_down():  # those of the motion are looked at before, and the rocks are known to be good
+        """Return margin and rotation; as auxiliary data these again, the verdict, and whether it is known."""
+        with put_down():  # `_strength` collects the motion's checks, and the rocks have passed theirs
             motion = self.motion(**dict(zip(self.names, parameters)))
             result = outcome(block, _of_strength(motion, level, way), self.model, engine=self.engine)
         rotation = jnp.where(result.overturned, 0.0, result.max_rotation)
@@ -348,7 +348,7 @@ class _Scene(eqx.Module):
         return real, (real, result.overturned, result.status == Status.successful)
 
     def rows(self, parameters: Real, level: Real, way: Real, block) -> tuple[Real, _Found]:
-        """Of many lanes, the rows of the Jacobian by the parameters, with the values; zero where there is none."""
+        """Return the rows of the Jacobian by the parameters, of many lanes, with the values; zero where not finite."""
 
         def one(parameters, *lane):
             _, back, found = jax.vjp(lambda x: self.results(x, *lane), parameters, has_aux=True)
@@ -360,7 +360,7 @@ class _Scene(eqx.Module):
 
 @eqx.filter_custom_jvp
 def _sloping(values: Real, rows: Real, parameters: Real, *lanes) -> Real:
-    """Values, (lanes, results), with the rows of their Jacobian by parameters, (lanes, results, parameters)."""
+    """Return values, (lanes, results); `rows`, (lanes, results, parameters), are their Jacobian by parameters."""
     return values
 
 
@@ -373,13 +373,13 @@ def _(primals, tangents):
         )
     _, rows, parameters, *lanes = primals
     rows = _bending(rows, parameters, *lanes)
-    values = _sloping(*primals)  # the values alone would have no derivatives of higher order
+    values = _sloping(*primals)  # plain `primals[0]` would lose derivatives of higher order
     return values, jnp.einsum("...ij,...j->...i", rows, tangents[2])
 
 
 @eqx.filter_custom_jvp
 def _bending(rows: Real, parameters: Real, scene: _Scene, *lanes) -> Real:
-    """Rows, with their derivatives by parameters: only who asks for second derivatives has them computed."""
+    """Return rows with their derivatives by parameters, which are computed only for second derivatives."""
     return rows
 
 
@@ -391,7 +391,7 @@ def _(primals, tangents):
 
 @jax.custom_jvp
 def _without_slopes(parameters: Real) -> Real:
-    """Parameters by which nobody may differentiate."""
+    """Return the parameters, and raise an error on differentiation."""
     return parameters
 
 

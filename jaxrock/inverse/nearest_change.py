@@ -1,9 +1,9 @@
-"""The nearest place, in a space of changes of a record, where margins of blocks are as wanted: by slopes and rays.
+"""Find the smallest change of a record with which the margins of blocks reach their targets: a design-point search.
 
-On the straight line from no change to a change that does what is wanted there is a first one that does. So a direction
-has a length, which is known by margins alone, and directions are turned by slopes: towards the least change that would
-do if margins were straight (Hasofer & Lind 1974; Rackwitz & Fiessler 1978), by that much, or less, as makes the length
-shorter. Verdicts decide about every step, so that margins that jump, or have a kink, mislead nobody.
+Along a direction of change there is a first length at which the targets are reached; computing it needs margins alone.
+Slopes of the margins then turn the direction. If margins were linear, one turn would lead to the least change (Hasofer
+& Lind 1974; Rackwitz & Fiessler 1978). The search turns by that much or less, whichever shortens the length. Verdicts
+decide about every step, so that jumps and kinks of margins do not mislead the search.
 """
 
 from collections.abc import Callable
@@ -27,17 +27,16 @@ from jaxrock.responses.outcome import outcome
 from jaxrock.status import Status
 
 _LANES = 64  # records in one call of the compiled program
-_SHORTEST, _LONGEST = 1e-4, 1e2  # lengths of changes that are looked at first, in root mean squares of the record
-_FINE = 1024  # factors of a record that are looked at, each half a per cent more than the one before
-_NOTHING = 1e-10  # of a change: what is left of it by rounding
-_CLOSER = 5  # times that the place on a line is looked for, each 64 times as close
-_TURNS = 0.5 ** np.arange(8)  # shares of the way to the direction that straight margins would have
-_SHORTER = np.array([0.7, 0.85, 0.93, 0.97, 0.985, 0.993, 0.997, 0.999])  # of the length before
+_SHORTEST, _LONGEST = 1e-4, 1e2  # range of lengths tried first along a direction, over the record's root mean square
+_FINE = 1024  # number of scale factors of a record that are tried, each half a per cent above the preceding one
+_NOTHING = 1e-10  # share of a change that rounding may leave of it after the projection
+_CLOSER = 5  # refinements of the length along a direction, each by a factor of 64
+_TURNS = 0.5 ** np.arange(8)  # shares of the turn towards the change that linear margins would need
+_SHORTER = np.array([0.7, 0.85, 0.93, 0.97, 0.985, 0.993, 0.997, 0.999])  # lengths tried, over the current one
 
 
 class Site(eqx.Module):
-    """Blocks under a record, and the margins that are wanted: not above `target` where `side` is 1, not below it where
-    that is -1."""
+    """Blocks under a record, and their target margins: at most `target` where `side` is 1, at least where it is -1."""
 
     blocks: Block | AsymmetricBlock
     samples: Float[Array, " n"]
@@ -48,14 +47,16 @@ class Site(eqx.Module):
     engine: AbstractEngine | None
 
     def margin(self, block: Block | AsymmetricBlock, change: Float[Array, " n"]):
-        """The margin of a block under the changed record, and whether it is known."""
+        """Return the margin of a block under the changed record, and whether it is known."""
         record = Record(self.samples + change, self.dt, throw=False)
         result = outcome(block, record, self.model, engine=self.engine, throw=False)
         return result.margin, result.status == Status.successful
 
     def margins(self, changes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Those of all blocks under any number of changes, (changes, n): (changes, blocks), and whether each is known;
-        one compiled program serves for all."""
+        """Return the margins of all blocks under changes, (changes, n), and whether each is known.
+
+        Both results are (changes, blocks). One compiled program serves any number of changes.
+        """
         margins, known = in_batches(lambda *part: _margins(self, *part), changes, _LANES)
         return margins, known
 
@@ -67,7 +68,7 @@ def _margins(
     own = jax.tree.map(lambda whole: None if whole else 0, shared(site.blocks))
     of_all = jax.vmap(site.margin, in_axes=(own, None))
 
-    def of_one(change, wanted):  # under a record that is none a scene ends at once
+    def of_one(change, wanted):  # a scene under a record of NaN ends at once
         margins, known = of_all(site.blocks, jnp.where(wanted, change, jnp.nan))
         return jnp.where(wanted, margins, 0.0), known & wanted
 
@@ -76,7 +77,7 @@ def _margins(
 
 @quickly(eqx.filter_jit, follows_scenes=True)
 def _margins_and_slopes(site: Site, change: Float[ArrayLike, " n"]):
-    """Margins of all blocks, (blocks,), and their derivatives by the change, (blocks, n)."""
+    """Return margins of all blocks, (blocks,), and their derivatives by the change, (blocks, n)."""
 
     def one(number):
         block = one_of_many(site.blocks, number)
@@ -86,8 +87,12 @@ def _margins_and_slopes(site: Site, change: Float[ArrayLike, " n"]):
 
 
 class Found(NamedTuple):
-    """A change that does what is wanted: its direction, of root mean square 1, and its length [g]; the lengths on the
-    way to it, and the largest slope of a margin by a length [1/g] where it was turned last."""
+    """A change that reaches the targets.
+
+    - `direction`: of root mean square 1; `length`: root mean square of the change [g].
+    - `lengths`: those after each step of the search.
+    - `slope`: largest slope of a margin by a length [1/g], at the last turn.
+    """
 
     direction: np.ndarray
     length: float
@@ -114,17 +119,17 @@ class Search(NamedTuple):
         return ((side * (margin - target) <= 0) & known).all(axis=1)
 
     def slopes(self, change: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """By how much margins fail, (blocks,), and its derivatives by the allowed changes, (blocks, n) [1/g]."""
+        """Return the excess of margins over targets, (blocks,), and slopes by allowed changes, (blocks, n) [1/g]."""
         margin, slopes = map(np.asarray, _margins_and_slopes(self.site, change))
         side = np.asarray(self.site.side)
         slopes = side[:, None] * np.where(np.isfinite(slopes), slopes, 0.0)
         return side * (margin - np.asarray(self.site.target)), self.allowed(slopes)
 
     def in_direction(self, direction: np.ndarray, fine: bool = False) -> Found | None:
-        """The first change in a direction that does what is wanted, of some that are looked at; None: there is none.
+        """Return the shortest tried change in a direction that reaches the targets; None if none does.
 
-        Each is a quarter longer than the one before; `fine`: of a change that scales, each makes the record half a per
-        cent larger than the one before.
+        Each trial is a quarter longer than the preceding one. With `fine`, for a change that scales the record, trials
+        that make the record half a per cent larger each are added.
         """
         scale = rms(direction)
         if not scale > 0:
@@ -141,7 +146,7 @@ class Search(NamedTuple):
         return self._closer(Found(direction, lengths[first]), lengths[first - 1] if first else 0.0)
 
     def _closer(self, found: Found, below: float) -> Found:
-        """The same where it does just what is wanted; it does not `below`."""
+        """Refine the length to where the change just reaches the targets; at the length `below` it does not."""
         above = found.length
         for _ in range(_CLOSER):
             lengths = np.linspace(below, above, _LANES + 1)[1:]
@@ -152,9 +157,9 @@ class Search(NamedTuple):
         return found._replace(length=float(above))
 
     def nearer(self, found: Found, steps: int, progress: Callable[[], None] = lambda: None) -> Found:
-        """Return a shorter change that reaches the same target.
+        """Return a shorter change that reaches the same targets.
 
-        It is turned, at most `steps` times, until no direction that is tried shortens it by a thousandth.
+        The search turns it, at most `steps` times, until no direction tried shortens it by a thousandth.
         """
         lengths, slope = [found.length], np.nan
         for _ in range(steps):
@@ -186,12 +191,12 @@ class Search(NamedTuple):
 
 
 def rms(changes: np.ndarray) -> Any:
-    """Root mean squares, (...), of changes (..., n)."""
+    """Return root mean squares, (...), of changes (..., n)."""
     return np.sqrt(np.mean(np.square(changes), axis=-1))
 
 
 def least_change(slopes: np.ndarray, bound: np.ndarray) -> np.ndarray | None:
-    """The shortest change (n,) with slopes @ change <= bound, of slopes (blocks, n); None where there is none.
+    """Return the shortest change (n,) with slopes @ change <= bound, for slopes (blocks, n); None if there is none.
 
     **Source:** Lawson & Hanson (1974), 23.4: least distance programming.
     """
@@ -214,9 +219,11 @@ def least_change(slopes: np.ndarray, bound: np.ndarray) -> np.ndarray | None:
 def allowed_changes(
     count: int, dt: float, band: tuple[float, float] | None, baseline: bool, kept: np.ndarray | None = None
 ) -> Callable:
-    """The orthogonal projection of changes, (..., n), onto those within a band of frequencies [Hz] that leave velocity
-    and displacement at the end of the record as they are, if `baseline`; and whose products with `kept`, (rows, n),
-    vanish."""
+    """Return the orthogonal projection of changes, (..., n), onto the allowed ones.
+
+    Allowed changes lie within a band of frequencies [Hz]. If `baseline`, they preserve velocity and displacement at the
+    end of the record. Their products with the rows of `kept`, (rows, n), vanish.
+    """
     inside = np.ones(count // 2 + 1, bool)
     if band is not None:
         frequency = np.fft.rfftfreq(count, dt)
@@ -236,17 +243,17 @@ def allowed_changes(
     def projected(changes: np.ndarray) -> np.ndarray:
         within = in_band(changes)
         left = within - (within @ rows.T) @ rows
-        # Of what is not allowed at all rounding is left, which is no direction.
+        # Projecting a change that is not allowed at all leaves only rounding errors, which are no direction.
         return np.where(rms(left) > _NOTHING * rms(changes), left.T, 0.0).T
 
     return projected
 
 
 def _baseline(count: int, dt: float) -> np.ndarray:
-    """Velocity and displacement at the end by all samples, (2, n), in units of their own."""
+    """Return coefficients of the final velocity and displacement by all samples, (2, n), in arbitrary units."""
     time = dt * np.arange(count)
     velocity, displacement = np.ones(count), time[-1] - time
-    # Of straight lines between samples, exactly.
+    # The integrals of straight lines between samples are exact.
     velocity[[0, -1]] = 0.5
     displacement[[0, -1]] = time[-1] / 2 - dt / 6, dt / 6
     return np.stack([velocity, displacement / time[-1]])

@@ -1,20 +1,21 @@
-"""Rocks and what they have shown, from a CSV file.
+"""Read rocks and their observed outcomes from a CSV file.
 
-The first line that is not a comment (#) names the columns, with their units; the others hold a rock each. In any order:
+The first line that is not a comment (#) names the columns, with their units; each other line holds a rock. The columns,
+in any order:
 
 - `name`: optional.
 - `alpha_rad` or `alpha_deg`: slenderness angle; and `p_rad_per_s`, or `half_diagonal_m` of a rectangle (p = sqrt(3 g/4
   R), g = 9.81 m/s^2). Or, instead of both, `width_m` and `height_m`, full sizes of a rectangle.
-- Of rocks whose sides differ, in place of these: `alpha1_rad` and `alpha2_rad`, or `alpha1_deg` and `alpha2_deg`; with
+- For rocks whose sides differ, in place of these: `alpha1_rad` and `alpha2_rad`, or `alpha1_deg` and `alpha2_deg`; with
   `p1_rad_per_s` and `p2_rad_per_s`, or `radius1_m` and `radius2_m`, the distances from the corners to the centre of
-  mass. `inertia_ratio` is m R1^2/I1, optional; empty is 3/4, that of a rectangle. `facing`, optional: 1 where positive
-  ground acceleration drives the rock from side 1 to side 2, -1 where it stands the other way round; empty is not known.
-- `restitution`: optional; empty is Housner's. Of rocks whose sides differ the root of the product of those of both
-  sides; empty is by angular momentum.
-- `observed`: survived, toppled (stood, fell and the like are understood), or rotation (rocked); then `rotation_rad` or
-  `rotation_deg` holds the largest |rotation|, which is empty otherwise.
-- `..._sd` of the measured ones, such as `alpha_deg_sd`: standard deviation, in the same unit; empty is 0. A measured
-  rotation needs one. Those of side 1 are for both sides, which are off by the same factor.
+  mass. `inertia_ratio` is m R1^2/I1, optional; empty means 3/4, the value of a rectangle. `facing`, optional: 1 where
+  positive ground acceleration drives the rock from side 1 to side 2, -1 for the other orientation; empty means unknown.
+- `restitution`: optional; empty means Housner's value. For rocks whose sides differ it is the root of the product of
+  both sides' values; empty means by angular momentum.
+- `observed`: survived, toppled (stood, fell and similar words are accepted), or rotation (rocked). For a rotation,
+  `rotation_rad` or `rotation_deg` holds the largest |rotation|; it is empty otherwise.
+- `..._sd` of measured columns, such as `alpha_deg_sd`: standard deviation, in the same unit; empty means 0. A measured
+  rotation needs one. Deviations of side 1 hold for both sides, which are off by the same factor.
 """
 
 import csv
@@ -43,7 +44,7 @@ column,18.0,0.5,1.10,stood,,
 """
 
 _DEGREE = np.pi / 180
-_LEAST_DEGREES = 0.5  # of a slenderness: what is less is in radians
+_LEAST_DEGREES = 0.5  # least slenderness in degrees; a smaller value is probably in radians
 
 _FACTORS = {
     "alpha_rad": 1.0, "alpha_deg": _DEGREE, "p_rad_per_s": 1.0, "half_diagonal_m": 1.0, "width_m": 1.0, "height_m": 1.0,
@@ -57,7 +58,7 @@ _EXACT = {
 
 _COLUMNS = {"name", "observed", *_FACTORS, *(f"{name}_sd" for name in _FACTORS), *_EXACT}
 
-# One column of each row must be there; and all or none of each pair.
+# A file must have exactly one column of each row of _WAYS, and both or none of each pair.
 _WAYS = (
     ("alpha_rad", "alpha_deg", "width_m", "alpha1_rad", "alpha1_deg"),
     ("p_rad_per_s", "half_diagonal_m", "height_m", "p1_rad_per_s", "radius1_m"),
@@ -70,27 +71,27 @@ _PAIRS = (
 
 
 def read_observations(path: str | Path) -> Observations:
-    """Read rocks and what they have shown from a CSV file.
+    """Read rocks and their observed outcomes from a CSV file.
 
     **Arguments:**
 
     - `path`: of the file.
 
-    The first line that is not a comment (#) names the columns, with their units; the others hold a rock each:
+    The first line that is not a comment (#) names the columns, with their units; each other line holds a rock:
 
     - `name`: optional.
     - `alpha_rad` or `alpha_deg`, with `p_rad_per_s` or `half_diagonal_m` (of a rectangle); or `width_m` and `height_m`.
-    - Of rocks whose sides differ instead: `alpha1_rad` and `alpha2_rad` (or `_deg`), with `p1_rad_per_s` and
-      `p2_rad_per_s`, or `radius1_m` and `radius2_m`; optional `inertia_ratio` (m R1^2/I1; empty is 3/4) and `facing`
-      (1, -1; empty is not known).
-    - `restitution`: optional; empty is by angular momentum.
-    - `observed`: survived (stood), toppled (fell), or rotation (rocked); of the last `rotation_rad` or `rotation_deg`.
-    - `..._sd` of what was measured, such as `alpha_deg_sd`: standard deviation in the same unit; empty is 0. A rotation
-      needs one; `alpha2`, `p2_rad_per_s`, `radius2_m`, `inertia_ratio` and `facing` have none.
+    - For rocks whose sides differ instead: `alpha1_rad` and `alpha2_rad` (or `_deg`), with `p1_rad_per_s` and
+      `p2_rad_per_s`, or `radius1_m` and `radius2_m`; optional `inertia_ratio` (m R1^2/I1; empty means 3/4) and
+      `facing` (1, -1; empty means unknown).
+    - `restitution`: optional; empty means by angular momentum.
+    - `observed`: survived (stood), toppled (fell), or rotation (rocked), which needs `rotation_rad` or `rotation_deg`.
+    - `..._sd` of measured columns, such as `alpha_deg_sd`: standard deviation in the same unit; empty means 0. A
+      rotation needs one; `alpha2`, `p2_rad_per_s`, `radius2_m`, `inertia_ratio` and `facing` have none.
 
     **Returns:** an `Observations`.
 
-    **Raises:** ValueError, with the number of the line, for a file that is wrong, or a rock that cannot be.
+    **Raises:** ValueError, with the number of the line, for a malformed file or an impossible rock.
     """
     path = path_of("path", path)
     lines = text_lines(path)
@@ -135,7 +136,7 @@ def _observations(rocks: list[dict], names: list[str] | None = None) -> Observat
 
 
 def _check_comments(file: str, lines: list[str], first: int, header: list[str]) -> None:
-    """That none after the header, in line `first`, is a rock."""
+    """Raise ValueError if a comment after the header, in line `first`, looks like a rock."""
     for number, line in enumerate(lines[first:], first + 1):
         if line.lstrip().startswith("#") and len(next(csv.reader([line]))) == len(header):
             said = "looks like a rock, but a line that begins with # is a comment; put its name in another way."
@@ -163,7 +164,7 @@ def _check_header(file: str, header: list[str]) -> None:
 
 
 def _check_shapes(file: str, header: set[str]) -> None:
-    """Each measure in one way, and of two sides both."""
+    """Raise ValueError unless each measure has one column, and each measure of two sides both."""
     for way in _WAYS:
         if len(header.intersection(way)) != 1:
             raise file_error(file, f"must have one of the columns {', '.join(way)}, and only one.")
@@ -181,11 +182,11 @@ def _check_shapes(file: str, header: set[str]) -> None:
 
 
 def _rock(fields: dict[str, str]) -> dict:
-    """A rock from the fields of its line."""
+    """Return a rock from the fields of its line."""
     values = {name: _number(name, fields.get(name, "")) for name in fields if name not in ("name", "observed")}
 
     def get(name, empty):
-        """A value, or the first of several units of it that is there; and its standard deviation."""
+        """Return the value of a column, in any of its units, in rad where angular; and its standard deviation."""
         for unit in (name, f"{name}_rad", f"{name}_deg"):
             if unit in fields:
                 value, sd = values[unit], values.get(f"{unit}_sd")
@@ -211,7 +212,7 @@ def _rock(fields: dict[str, str]) -> dict:
 
 
 def _check_degrees(values: dict[str, float | None]) -> None:
-    """That slendernesses in degrees are none in radians."""
+    """Raise ValueError if a slenderness in degrees is so small that it must be in radians."""
     for name in ("alpha_deg", "alpha1_deg", "alpha2_deg"):
         value = values.get(name)
         if value is not None and 0 < value < _LEAST_DEGREES:
@@ -220,7 +221,7 @@ def _check_degrees(values: dict[str, float | None]) -> None:
 
 
 def _rotation(observed: str, get) -> tuple[float, float]:
-    """The rotation that was measured, and its standard deviation; 1 where none was."""
+    """Return the measured rotation and its standard deviation; both are 1 if none was measured."""
     rotation, deviation = get("rotation", None)
     measured = called(observed) == "rotation"
     if measured and (rotation is None or deviation <= 0):
@@ -232,7 +233,7 @@ def _rotation(observed: str, get) -> tuple[float, float]:
 
 
 def _size(fields: dict[str, str], get) -> dict:
-    """Frequency parameter and its standard deviation."""
+    """Return the frequency parameter and its standard deviation."""
     if "p_rad_per_s" in fields:
         p, deviation = _given("p_rad_per_s", get("p_rad_per_s", None))
         return {"p": p, "p_sd": deviation}
@@ -242,7 +243,7 @@ def _size(fields: dict[str, str], get) -> dict:
 
 
 def _two_sides(fields: dict[str, str], get) -> dict:
-    """Angles and sizes of a rock whose sides differ; deviations are those of side 1."""
+    """Return angles and sizes of a rock whose sides differ; deviations are those of side 1."""
     (alpha1, deviation), (alpha2, _) = (_given(name, get(name, None)) for name in ("alpha1", "alpha2"))
     facing, inertia = (get(name, empty)[0] for name, empty in (("facing", 0.0), ("inertia_ratio", 0.75)))
     _within(ratio_of_inertia, "inertia_ratio", inertia)
@@ -257,7 +258,7 @@ def _two_sides(fields: dict[str, str], get) -> dict:
 
 
 def _rectangle(width: tuple[float, float], height: tuple[float, float]) -> dict:
-    """Slenderness and frequency parameter of a rectangle, with their standard deviations to first order."""
+    """Return slenderness and frequency parameter of a rectangle, with standard deviations to first order."""
     (b, b_sd), (h, h_sd) = _positive("width_m", width), _positive("height_m", height)
     square = b**2 + h**2
     p = np.sqrt(3 * GRAVITY / (2 * np.sqrt(square)))
@@ -289,7 +290,7 @@ def _number(name: str, text: str) -> float | None:
     if not text:
         return None
     try:
-        if "_" in text:  # which Python reads over
+        if "_" in text:  # `float` accepts underscores between digits
             raise ValueError
         value = float(text)
     except ValueError:

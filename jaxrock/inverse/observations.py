@@ -1,4 +1,4 @@
-"""What rocks have shown: which stand, which fell, how far one rocked, and how well each of them is known."""
+"""Observations of rocks: which stand, which toppled, how far one rocked, and how accurately each of them is known."""
 
 from collections.abc import Sequence
 from typing import Annotated, Any
@@ -32,7 +32,7 @@ from jaxrock.blocks.restitution import AngularMomentum, Corners, Housner
 from jaxrock.blocks.rigid import Block
 
 SEEN = ("survived", "toppled", "rotation")
-_ALSO = {  # what people write, too
+_ALSO = {  # synonyms that are accepted
     "survived": ("stood", "stands", "standing", "stable", "survives", "upright"),
     "toppled": ("fell", "fallen", "falls", "overturned", "overturns", "topples"),
     "rotation": ("rocked", "measured"),
@@ -44,13 +44,13 @@ Real = Inexact[Array, "..."]
 
 
 class OtherSide(eqx.Module):
-    """How side 2 of asymmetric rocks differs from side 1, and which way round they stand; (..., rocks) each.
+    """Side 2 of asymmetric rocks relative to side 1, and the orientation of the rocks; (..., rocks) each.
 
     - `alpha_ratio`: alpha2/alpha1; `radius_ratio`: R2/R1.
     - `inertia_ratio`: m R1^2/I1.
-    - `restitution_ratio`: that of an impact that ends the stay on side 1 over that of one that ends it on side 2.
-    - `ways`: (ways, rocks) signs of the motion that each rock may have felt, all equally likely: one row, or two where
-      that is not known of some rocks.
+    - `restitution_ratio`: restitution of the impact that ends the stay on side 1, over that on side 2.
+    - `ways`: (ways, rocks) signs of the motion that each rock may have felt, all equally likely: one row, or two if
+      the orientation of some rocks is unknown.
     """
 
     __repr__ = described
@@ -63,9 +63,9 @@ class OtherSide(eqx.Module):
 
 
 class Observations(eqx.Module):
-    """Rocks at one site, and what each of them did in one shaking.
+    """Rocks at one site, and the outcome of each in one shaking.
 
-    Symmetric ones; `Observations.asymmetric` makes those of rocks whose sides differ.
+    The constructor takes symmetric rocks; `Observations.asymmetric` takes rocks whose sides differ.
 
     **Arguments:**
 
@@ -73,13 +73,13 @@ class Observations(eqx.Module):
     - `p`: (rocks,) frequency parameters [rad/s], positive.
     - `seen`: for each rock "survived", "toppled", or "rotation" (its largest rotation was measured, and it stands).
     - `restitution`: (rocks,) in [0, 1]; None, or NaN for a rock, is Housner's value, which follows alpha.
-    - `alpha_sd`, `p_sd`, `restitution_sd`: (rocks,) or one number: standard deviations, 0 or more, in the units of what
-      they belong to; of alpha and p below the value itself. Alpha and p are uncertain by lognormal factors, the
-      restitution by a normal sum within [0, 0.99].
+    - `alpha_sd`, `p_sd`, `restitution_sd`: (rocks,) or one number: standard deviations, 0 or more, in the units of
+      their parameters; those of alpha and p below the value itself. Alpha and p are uncertain by lognormal factors, the
+      restitution by a normal term within [0, 0.99].
     - `rotation`, `rotation_sd`: (rocks,) the measured largest |rotation| and its standard deviation [rad], positive,
       below 2 alpha and alpha; not read for rocks without one.
     - `names`: of the rocks; None numbers them.
-    - `other`: what `Observations.asymmetric` knows of their second sides; None: symmetric ones.
+    - `other`: the `OtherSide` that `Observations.asymmetric` sets; None: symmetric rocks.
 
     **Raises:** ValueError for values outside their ranges, or of different lengths.
     """
@@ -158,20 +158,20 @@ class Observations(eqx.Module):
         facing: Values = 0.0,
         **known: Any,
     ) -> "Observations":
-        """Observations of rocks whose sides differ.
+        """Return observations of rocks whose sides differ.
 
         **Arguments:**
 
         - `blocks`: an `AsymmetricBlock` of (rocks,) arrays.
         - `seen`: as in `Observations`.
-        - `restitution`: (rocks,) root of the product of those of both sides, whose ratio is
-          that of `blocks`. None, or NaN for a rock: that of `blocks`, where none was given by angular momentum.
+        - `restitution`: (rocks,) root of the product of both sides' restitutions, whose ratio is that of `blocks`.
+          None, or NaN for a rock: that of `blocks`, which is by angular momentum where none was given.
         - `facing`: (rocks,) or one number: 1 where positive ground acceleration drives the rock from side 1 to side 2,
-          as it does a block; -1 where it stands the other way round; 0 where that is not known, which is each rock's
-          own coin: its probabilities are the means over both ways. (For a shaking whose direction is not known, but is
-          one for all, state how rocks face each other, and let the amplitude be of either sign.)
-        - `known`: the rest, as in `Observations`. `alpha_sd` and `p_sd` belong to side 1: both angles are off by the
-          same factor, and so are both frequency parameters.
+          as it does a block; -1 for the other orientation; 0 where it is unknown. Orientations of 0 are independent:
+          the probabilities of such a rock are means over both. (For a shaking of unknown direction, the same for all
+          rocks, state how rocks face each other, and let the amplitude have either sign.)
+        - `known`: the other arguments, as in `Observations`. `alpha_sd` and `p_sd` belong to side 1: both angles are
+          off by the same factor, and so are both frequency parameters.
 
         **Returns:** an `Observations`.
 
@@ -197,7 +197,7 @@ class Observations(eqx.Module):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of the rocks."""
+        """Names of the rocks."""
         return self.label.value
 
     @property
@@ -212,18 +212,18 @@ class Observations(eqx.Module):
 
     @property
     def widest(self) -> Rocks:
-        """The largest alpha of side 1 that a rock may have."""
+        """The largest allowed alpha of side 1."""
         if self.other is None:
             return jnp.where(self.follows, 0.955, 1.55)
         return 1.55 / jnp.maximum(1.0, self.other.alpha_ratio)
 
     def by_momentum(self, alpha: Inexact[Array, "*shape rocks"]) -> Inexact[Array, "*shape rocks"]:
-        """Restitution by angular momentum: Housner's, or the root of the product of both."""
+        """Return the restitution by angular momentum: Housner's, or the root of the product of both sides'."""
         return _by_momentum(self.other, alpha, self.p)
 
     @called_by_users
     def blocks_at(self, alpha: ArrayLike, p: ArrayLike, restitution: ArrayLike | None) -> Block | AsymmetricBlock:
-        """The rocks, were these their values on side 1, (..., rocks): one block of arrays; they are not checked."""
+        """Return the rocks with other values on side 1, (..., rocks), unchecked, as one block of arrays."""
         with put_down():
             return Block(alpha, p, restitution) if self.other is None else _two_sided(self.other, alpha, p, restitution)
 
@@ -234,7 +234,7 @@ class Observations(eqx.Module):
 
     @called_by_users
     def of(self, which: ArrayLike) -> "Observations":
-        """Some of the rocks: `which` is an array of their numbers, or of a truth value for each."""
+        """Return some of the rocks: `which` is an array of their indices, or of a truth value for each."""
         index = _chosen(which, self.alpha.size)
         numbers = ("alpha", "p", "alpha_sd", "p_sd", "restitution_sd", "rotation", "rotation_sd")
         known = {name: getattr(self, name) for name in numbers}
@@ -254,7 +254,7 @@ def _two_sided(other: OtherSide, alpha: ArrayLike, p: ArrayLike, restitution: Ar
 
 @eqx.filter_jit
 def _by_momentum(other: OtherSide | None, alpha: Real, p: Rocks) -> Real:
-    """Compiled as one: outside of other programs every operation would be one of its own."""
+    """Return the restitution by angular momentum. Without `jit`, JAX would dispatch each operation separately."""
     if other is None:
         return Housner().ratio(Corners(alpha, alpha, p), jnp.zeros_like(alpha))
     with put_down():
@@ -267,14 +267,14 @@ def _is_missing(values: Array) -> Array | np.ndarray:
 
 
 def _where(which: ArrayLike, this: ArrayLike, that: ArrayLike) -> Array:
-    """`jnp.where`; by NumPy where all is known, for which nothing is compiled."""
+    """Return `jnp.where`; concrete values use NumPy, which compiles nothing."""
     if is_traced((which, this, that)):
         return jnp.where(which, this, that)
     return placed(np.where(which, this, that))
 
 
 def _chosen(which: ArrayLike, count: int) -> np.ndarray:
-    """Numbers of the rocks that are meant."""
+    """Return the indices of the selected rocks."""
     known = isinstance(which, (list, tuple, np.ndarray, jax.Array, int, np.integer))
     given = np.asarray(which if known else None)
     good = given.ndim == 1 and given.size > 0
@@ -313,17 +313,17 @@ def _words(seen: Sequence[str], count: int) -> Int[Array, " rocks"]:
         if called(word) is None:
             told = f"must hold only {', '.join(map(repr, SEEN))}, but holds {word!r}.{meant(word, CALLED)}"
             raise ValueError(f"Argument `seen` {told}")
-    with jax.ensure_compile_time_eval():  # known within `jax.jit`, too
+    with jax.ensure_compile_time_eval():  # the result stays concrete within `jax.jit`
         return placed(np.array([SEEN.index(called(word)) for word in seen]))
 
 
 def called(word: str) -> str | None:
-    """What has been seen of a rock, by the name that it has here; None for a word that is not known."""
+    """Return the canonical word of `SEEN` for an observed outcome; None for an unknown word."""
     return CALLED.get(word.strip().lower()) if isinstance(word, str) else None
 
 
 def _check_below(name: str, value: Rocks, most: Rocks, what: str) -> None:
-    """Raise ValueError where a known value comes to a known bound: a slip of units."""
+    """Raise ValueError where a concrete value reaches a concrete bound, which suggests a wrong unit."""
     if is_traced((value, most)):
         return
     known, most = np.asarray(value), np.asarray(most)
@@ -332,7 +332,7 @@ def _check_below(name: str, value: Rocks, most: Rocks, what: str) -> None:
 
 
 def _measured(name: str, value: Values | None, measured: np.ndarray) -> Rocks:
-    """Values of the rocks with a measured rotation; 1 for the others."""
+    """Return the values of rocks with a measured rotation; 1 for the others."""
     if value is None and measured.any():
         raise ValueError(f'Argument `{name}` must be given where `seen` is "rotation".')
     array = _list(name, 1.0 if value is None else value, measured.size)
@@ -341,14 +341,14 @@ def _measured(name: str, value: Values | None, measured: np.ndarray) -> Rocks:
 
 @one_program
 def _of_two_impacts(first: Rocks, second: Rocks, p1: Rocks, p2: Rocks, radii: Rocks) -> tuple[Rocks, Rocks]:
-    """Ratio of the restitutions of both sides, and the root of their product."""
-    # By momentum the numerators of both restitutions are the same, and their ratio is I1/I2.
+    """Return the ratio of the restitutions of both sides, and the root of their product."""
+    # By angular momentum both restitutions have the same numerator, so that their ratio is I1/I2.
     ratio = jnp.where((first > 0) & (second > 0), first / second, (p2 / p1) ** 2 / radii)
     return ratio, jnp.sqrt(first * second)
 
 
 @one_program
 def _ways(facing: Rocks) -> tuple[Real, Real]:
-    """Signs of the motion, (ways, rocks): if it is known how all rocks stood, and if not."""
+    """Return signs of the motion, (ways, rocks): if all orientations are known, and if not."""
     both = jnp.stack([jnp.where(facing == 0, sign, facing) for sign in (1.0, -1.0)])
     return both[:1], both

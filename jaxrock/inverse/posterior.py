@@ -1,10 +1,10 @@
-"""Samples of the posterior distribution of a motion's parameters (with NumPyro's diagnostics, an extra).
+"""Sample the posterior distribution of a motion's parameters (with NumPyro's diagnostics, an extra).
 
-The posterior has several maxima and ridges, parameters are few, and densities are dear: so chains whose proposals learn
-where it is first (see `proposals`), from the maxima of an estimate and from everywhere. Whether chains agree tells
-whether they have arrived; not whether there is a maximum that neither the estimate nor any proposal has met. (Ensembles
-of walkers, by NumPyro's AIES, take many times as many points: benchmarks/inverse.md.) Any sampler of NumPyro or
-BlackJAX takes their place where one is given (see `samplers`).
+The posterior has several maxima and ridges, parameters are few, and densities are expensive. The chains therefore use
+independent proposals that first adapt to the posterior (see `proposals`), starting from the maxima of an estimate and
+from the whole range. Agreement of the chains shows convergence. It cannot show that no maximum was missed by both the
+estimate and the proposals. (Ensembles of walkers, by NumPyro's AIES, take many times as many points:
+benchmarks/inverse.md.) The user can give any sampler of NumPyro or BlackJAX instead (see `samplers`).
 """
 
 from collections.abc import Callable
@@ -34,12 +34,12 @@ from jaxrock.status import Enumeration, item
 
 Real = Inexact[Array, "..."]
 _CHAINS = 8
-_ROUND = 512  # points of a round: those of all chains together
-_PATIENCE, _POOR = 512, 0.03  # steps after which chains begin anew where samples are worth less than that
-_DEPTH = 6.0  # log-density below the best maximum down to which maxima are places to begin at
-_JITTER, _INSIDE = 0.1, 6.0  # of the points at which other samplers begin, around maxima, and how far out
-_ALIKE = 1.01  # R-hat
-_END = 0.02  # of a range, where samples are counted: an end is open if there are a fifth as many as of a uniform one
+_ROUND = 512  # points of a round, of all chains together
+_PATIENCE, _POOR = 512, 0.03  # steps before a restart; effective samples for each step below which chains restart
+_DEPTH = 6.0  # chains start at maxima whose log-density is at most so much below the best
+_JITTER, _INSIDE = 0.1, 6.0  # scatter of the starts of other samplers around maxima; their largest |coordinate|
+_ALIKE = 1.01  # R-hat below which chains agree
+_END = 0.02  # share of a range at each end; open if it holds more than a fifth of a uniform distribution's samples
 
 
 class PosteriorStatus(Enumeration):
@@ -60,12 +60,12 @@ class Posterior(AbstractTable):
     """Samples of a posterior distribution.
 
     - `names`: the parameters; `samples`: (chains, steps, parameters), in their units.
-    - `log_density`: (chains, steps) log-likelihood and log-prior.
-    - `effective_size`: (parameters,) number of independent samples that would know the mean as well.
+    - `log_density`: (chains, steps) log-likelihood plus log-prior.
+    - `effective_size`: (parameters,) number of independent samples that would determine the mean as well.
     - `r_hat`: (parameters,) between halves of all chains, 1 if they agree.
     - `open`: (parameters, 2) whether the distribution reaches the end of its range.
-    - `responses`: how many scenes were computed, without those of the estimate.
-    - `estimate`: the `Estimate`, by whose maxima the distribution was looked for.
+    - `responses`: number of scenes computed, without those of the estimate.
+    - `estimate`: the `Estimate`, at whose maxima the chains started.
     - `status`: a `PosteriorStatus`.
     """
 
@@ -80,17 +80,17 @@ class Posterior(AbstractTable):
     status: PosteriorStatus
 
     def __getitem__(self, name: str) -> Real:
-        """All samples of a parameter, (samples,)."""
+        """Return all samples of a parameter, (samples,)."""
         return self.samples[..., self.names.index(name)].ravel()
 
     def interval(self, share: float = 0.95) -> Real:
-        """(parameters, 2) intervals that leave equal shares of the samples on both sides."""
+        """Return (parameters, 2) intervals that leave equal shares of the samples on both sides."""
         share = float(scalar("share", inner_share("share", share)))
         flat = self.samples.reshape(-1, len(self.names))
         return jnp.quantile(flat, jnp.array([(1 - share) / 2, (1 + share) / 2]), axis=0).T
 
     def to_arviz(self) -> Any:
-        """The samples for ArviZ (an extra of its own): an `InferenceData`, or from ArviZ 1.0 on a `DataTree`."""
+        """Return the samples for ArviZ (a separate extra): an `InferenceData`, or from ArviZ 1.0 on a `DataTree`."""
         import arviz
 
         samples = {name: np.asarray(self.samples[..., i]) for i, name in enumerate(self.names)}
@@ -99,7 +99,7 @@ class Posterior(AbstractTable):
         return made(**groups) if hasattr(arviz, "InferenceData") else made(groups)
 
     def summary(self) -> str:
-        """Mean, standard deviation, quantiles and diagnostics as a table, and the status."""
+        """Return a table of mean, standard deviation, quantiles and diagnostics, and the status."""
         lines = [f"{'':<12}{'mean':>10}{'sd':>10}{'2.5 %':>10}{'50 %':>10}{'97.5 %':>10}{'effective':>11}{'R-hat':>8}"]
         for i, name in enumerate(self.names):
             x = self[name]
@@ -137,7 +137,7 @@ def sample_motion(
     engine: AbstractEngine | None = None,
     progress: bool | None = None,
 ) -> Posterior:
-    """Sample the parameters of a motion given rocks that stand, fell, or rocked so far.
+    """Sample the parameters of a motion given rocks that stand, fell, or rocked by a measured angle.
 
     Priors are those of the `Unknown`s; without one, uniform over the range (in the logarithm if `log`). So the
     posterior is always proper, and as wide as the ranges where observations carry no information.
@@ -195,7 +195,7 @@ def sample_motion(
 
 
 class _Wanted(NamedTuple):
-    """Independent samples, steps of each chain at most, and the seed."""
+    """The required number of independent samples, the largest number of steps of a chain, and the seed."""
 
     size: int
     steps: int
@@ -207,8 +207,8 @@ class _Wanted(NamedTuple):
 
 
 class _Drawn(NamedTuple):
-    """Places (steps, chains, parameters), log-likelihood and log-prior there, diagnostics, and how many points were
-    computed."""
+    """Drawn samples: places (steps, chains, parameters), log-likelihood plus log-prior there, diagnostics, and the
+    number of points computed."""
 
     places: np.ndarray
     values: np.ndarray
@@ -224,7 +224,7 @@ def _by_proposals(problem: Problem, estimate: Estimate, wanted: _Wanted, bar: Pr
     chains, sizes = sampler.init(_summits(problem, estimate), random), np.zeros(0)
     for done in range(0, wanted.steps, _ROUND // _CHAINS):
         if chains.steps >= _PATIENCE and sizes.min() < _POOR * _CHAINS * chains.steps:
-            chains = sampler.anew(random, chains)  # they have met something, from which there is more to learn
+            chains = sampler.anew(random, chains)  # poor mixing: adapt the proposals to the chains, and start again
         chains, _ = sampler.step(random, chains, min(_ROUND // _CHAINS, wanted.steps - done))
         sizes, r_hat = diagnostics(chains.places[1:])
         bar.add(1)
@@ -258,7 +258,7 @@ def _by_another(make: Callable, problem: Problem, estimate: Estimate, wanted: _W
 
 
 class _Density:
-    """Log-densities at any number of places, in batches of one compiled program; it counts."""
+    """Evaluates log-densities at any number of places, in batches of one compiled program, and counts the places."""
 
     def __init__(self, problem: Problem):
         self.problem, self.count = problem.current(), 0
@@ -269,7 +269,7 @@ class _Density:
 
 
 def _summits(problem: Problem, estimate: Estimate) -> np.ndarray:
-    """Places of the best maxima of the estimate, (maxima, parameters)."""
+    """Return the places of the best maxima of the estimate, (maxima, parameters)."""
     values = np.asarray(estimate.summit_values)
     summits = np.asarray(estimate.summits)[values > values.max() - _DEPTH]
     logs = np.array([unknown.log for unknown in problem.unknowns.values()])
@@ -288,14 +288,17 @@ def _within(places: np.ndarray, low: np.ndarray, high: np.ndarray, dtype) -> boo
 
 
 def diagnostics(places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Effective sizes and R-hat, (parameters,) each, of places (steps, chains, parameters); few steps tell nothing."""
+    """Return effective sizes and R-hat, (parameters,) each, of places (steps, chains, parameters).
+
+    Fewer than four steps give 0 and infinity.
+    """
     from numpyro.diagnostics import effective_sample_size, split_gelman_rubin
 
     if len(places) < 4:
         return np.zeros(places.shape[-1]), np.full(places.shape[-1], np.inf)
     by_chain = places.swapaxes(0, 1)
     sizes, r_hat = np.asarray(effective_sample_size(by_chain)), np.asarray(split_gelman_rubin(by_chain))
-    # Chains that never moved.
+    # Chains that never moved have NaN diagnostics.
     return np.where(np.isnan(sizes), 0.0, sizes), np.where(np.isnan(r_hat), np.inf, r_hat)
 
 

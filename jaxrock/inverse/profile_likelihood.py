@@ -1,4 +1,4 @@
-"""The likelihood around its maximum: its curvature there, and profiles, which are intervals of parameters."""
+"""The likelihood around its maximum: the curvature there, and profiles, which give intervals of parameters."""
 
 from typing import NamedTuple
 
@@ -10,17 +10,17 @@ from jaxrock.numerics.climb import Summits, climb
 
 _RATIO = 1.9207  # log-likelihood ratio of 95 %, half of 1.96^2
 _ROOT = np.sqrt(2 * _RATIO)
-_PARABOLAS, _SETTLED = 4, 0.3  # fits of a parabola at most; change of the lengths of its axes that calls for none more
-_TELLING = 0.16  # bend over a range, squared, with which it falls by 0.02 over half of it: less may be steps
-_NOTHING = 50.0  # a fall after which the likelihood is none
-_BEYOND = (0.01, 0.02, 0.04, 0.08, 0.16, 0.32, 0.64)  # share of a range beyond an end, where the region may go on
+_PARABOLAS, _SETTLED = 4, 0.3  # most fits of a parabola; relative change of its axes below which they have converged
+_TELLING = 0.16  # least curvature, in squared ranges: a fall by 0.02 over half a range; less may be steps
+_NOTHING = 50.0  # fall of the log-likelihood at which falls are capped
+_BEYOND = (0.01, 0.02, 0.04, 0.08, 0.16, 0.32, 0.64)  # shares of a range beyond an end at which the region may resume
 _OUTWARD = 4  # number of such searches
-_BRACKETS, _NARROW, _NEAR = 10, 2e-3, 0.01  # rounds at most; width of a bracket, in ranges, and root that will do
+_BRACKETS, _NARROW, _NEAR = 10, 2e-3, 0.01  # most rounds; sufficient width of a bracket, in ranges, and error of root
 _MULTIPLES = 1.5, 3.0, np.inf  # standard deviations from the maximum at which profiles begin
 _SEEDS, _SCANNED = 2, 32  # climbers for each value; places of the preceding scan over the other parameters
 _BESIDE = 0.2  # extent of a second scan around the nearest place, in ranges: ridges are narrow
 _HOPE = 1.5  # depth below the region from which climbers may still reach it
-_AWAY = 0.02  # of a range, from its ends, where climbers begin: at an end none would move
+_AWAY = 0.02  # least distance of starting places from the ends of a range: at an end no climber would move
 
 
 class Shape(NamedTuple):
@@ -33,10 +33,10 @@ class Shape(NamedTuple):
 
 
 def shape_at(evaluate: Evaluator, point: np.ndarray) -> Shape:
-    """The bend of a parabola through values about a standard deviation away, where the likelihood has fallen by 1/2.
+    """Fit a parabola to values about a standard deviation away, where the log-likelihood has fallen by 1/2.
 
-    Slopes do not tell it: on a finer scale the likelihood has steps, between which it bends otherwise. Each parabola
-    says how far along its axes the next one looks, beside all values so far.
+    Derivatives do not give this curvature: on a finer scale the likelihood has steps, with other curvatures between
+    them. Each parabola sets the distances of the next points along its axes, and later fits use all values so far.
     """
     place = evaluate.places(point)
     size, count = np.ptp(evaluate.ends, axis=0), place.size
@@ -52,7 +52,7 @@ def shape_at(evaluate: Evaluator, point: np.ndarray) -> Shape:
         slope, bend = _parabola(offsets @ back, falls)
         bends, vectors = np.linalg.eigh(bend)
         axes, slopes = vectors.T @ axes, np.abs(vectors.T @ slope)
-        # How far a fall of 1/2 is: the root of slope length + bend length^2/2 = 1/2.
+        # The distance to a fall of 1/2 is the root of slope length + bend length^2/2 = 1/2.
         length = 1 / np.maximum(slopes + np.sqrt(np.maximum(slopes**2 + bends, 0.0)), 0.25)
         length = np.minimum(length, 0.5 / np.max(np.abs(axes), axis=1))
         axes *= length[:, None]
@@ -67,7 +67,7 @@ def shape_at(evaluate: Evaluator, point: np.ndarray) -> Shape:
 
 
 def _alone(evaluate: Evaluator, place: np.ndarray, top: np.ndarray) -> np.ndarray:
-    """A step along each parameter alone, in ranges, with which the likelihood falls by about 1/2."""
+    """Return steps along each parameter alone, in ranges, over which the log-likelihood falls by about 1/2."""
     length = np.full(place.size, 0.02)
     for _ in range(4):
         falls = top - evaluate.at(_around(evaluate, place, np.diag(length)))[0]
@@ -79,7 +79,7 @@ def _alone(evaluate: Evaluator, place: np.ndarray, top: np.ndarray) -> np.ndarra
 
 
 def _around(evaluate: Evaluator, place: np.ndarray, steps: np.ndarray) -> np.ndarray:
-    """A place and those at steps, in ranges, to both sides of it; of a place at an end, of one so far within."""
+    """Return a place and the places at steps, in ranges, to both sides; a place near an end is first moved inside."""
     low, high = evaluate.ends
     reach = np.minimum(np.max(np.abs(steps), axis=0), 0.5) * (high - low)
     moves = np.concatenate([np.zeros((1, place.size)), steps, -steps]) * (high - low)
@@ -87,7 +87,7 @@ def _around(evaluate: Evaluator, place: np.ndarray, steps: np.ndarray) -> np.nda
 
 
 def _parabola(offsets: np.ndarray, falls: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Slope and bend at 0 of the parabola nearest to falls, of which each has the weight of its likelihood."""
+    """Return slope and curvature at 0 of the least-squares parabola through falls, weighted by root likelihood."""
     count = offsets.shape[1]
     row, column = np.triu_indices(count)
     falls = np.minimum(np.nan_to_num(falls, nan=np.inf), _NOTHING)
@@ -109,7 +109,7 @@ class Profile(NamedTuple):
 
 
 class _Row(NamedTuple):
-    """A value of the parameter that is held, the root of twice the likelihood ratio there, and where the others are."""
+    """A value of the held parameter, the root of twice the log-likelihood ratio there, and the place."""
 
     value: float
     root: float
@@ -155,13 +155,13 @@ def profile(evaluate: Evaluator, summits: Summits, shape: Shape) -> Profile:
 
 
 def _secant(inner: _Row, outer: _Row, margin: float) -> float:
-    """Where the root is 1.96, between two values; not nearer to them than a share of their distance."""
+    """Return the value where the root is 1.96, by a secant; `margin` is its least distance from both, as a share."""
     share = (_ROOT - inner.root) / max(outer.root - inner.root, 1e-12)
     return inner.value + (outer.value - inner.value) * np.clip(share, margin, 1 - margin)
 
 
 class _Sides:
-    """What is known of the profiles on both sides of each parameter; a side is a parameter and -1 or 1."""
+    """The known rows of the profiles on both sides of each parameter; a side is a parameter and -1 or 1."""
 
     def __init__(self, evaluate: Evaluator, best: float, place: np.ndarray):
         self.evaluate, self.best = evaluate, best
@@ -242,7 +242,7 @@ class _Sides:
         return not (narrow or min(_ROOT - inner.root, outer.root - _ROOT) < _NEAR)
 
     def recall(self) -> None:
-        """Add to each side the outermost of all known places that are within 95 %: it may lie beyond a valley."""
+        """Add to each side the outermost known place within 95 %, which may lie beyond a valley."""
         places, values = self.evaluate.known
         within = values > self.best - _RATIO
         places, values = places[within], values[within]
@@ -252,13 +252,13 @@ class _Sides:
                 rows.append(_Row(places[i, j], np.sqrt(2 * max(self.best - values[i], 0.0)), places[i]))
 
     def _nearby(self, j: int, value: float, reach: float, otherwise: np.ndarray) -> np.ndarray:
-        """The best place known with parameter `j` nearer to a value than to that of a row so far away."""
+        """Return the best known place whose parameter `j` is within half of `reach` of a value; else `otherwise`."""
         places, values = self.evaluate.known
         near = np.abs(places[:, j] - value) <= reach / 2
         return places[near][np.argmax(values[near])] if near.any() else otherwise
 
     def bracket(self, side: tuple[int, int]) -> tuple[_Row, _Row] | None:
-        """The outermost neighbours between which the root passes 1.96; None if the last is below it."""
+        """Return the outermost neighbours between which the root passes 1.96; None if the last is below it."""
         rows = sorted(self.rows[side], key=lambda row: side[1] * row.value)
         if rows[-1].root < _ROOT:
             return None

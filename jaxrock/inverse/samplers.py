@@ -1,4 +1,4 @@
-"""Chains by samplers of NumPyro and BlackJAX, over the points of a log-density."""
+"""Run chains of NumPyro's and BlackJAX's samplers over the points of a log-density."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -10,12 +10,12 @@ import numpy as np
 from jaxrock._checks import shown
 from jaxrock.inverse.densities import LogDensity
 
-_ROUND = 250  # steps after which it is asked whether they are enough
-_WARM_UP = 2  # rounds that are not kept; a kernel of NumPyro adapts in them
+_ROUND = 250  # steps between two checks of the diagnostics
+_WARM_UP = 2  # rounds that are discarded; a kernel of NumPyro adapts in them
 
 
 class Steps(NamedTuple):
-    """Points (steps, chains, parameters), log-densities there (None: not told), and how many gradients they took."""
+    """Points (steps, chains, parameters), log-densities there (None if not reported), and the number of gradients."""
 
     points: np.ndarray
     log_density: np.ndarray | None
@@ -23,9 +23,9 @@ class Steps(NamedTuple):
 
 
 def rounds_of(make: Callable, density: LogDensity, points: np.ndarray, seed: int):
-    """Rounds of steps of a sampler from points, (chains, parameters), on and on: what `make(density)` makes.
+    """Return an endless generator of rounds of the sampler `make(density)`, started at points, (chains, parameters).
 
-    **Raises:** ValueError where that is neither a kernel of NumPyro with a `potential_fn`, nor an algorithm of BlackJAX
+    **Raises:** ValueError unless the sampler is a kernel of NumPyro with a `potential_fn`, or an algorithm of BlackJAX
     whose states have a position.
     """
     sampler = make(density)

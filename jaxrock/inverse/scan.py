@@ -1,7 +1,7 @@
-"""A scan of a likelihood: starting points of climbers, and the choice of competing summits among their results.
+"""Scan a likelihood for starting points of climbers, and choose competing summits among their results.
 
 Values at many places together, by few scenes and without slopes, are cheap. A first scan covers the ranges. A few more,
-each half as wide as the one before, lie around the best places so far.
+each half as wide as the preceding one, lie around the best places so far.
 """
 
 from typing import NamedTuple
@@ -16,12 +16,12 @@ Places = Float[np.ndarray, "n parameters"]
 _CENTRES, _AROUND = 16, 16  # best places of a scan, and places of the next one around each
 _NARROWER = (1.0, 0.5, 0.25)  # standard deviations around these, in distances of places of the first scan
 _BESIDE = 0.1  # share of the ranges within which a higher place excludes a lower one
-_COMPARED = 2000  # best places compared for that
-_FEWEST = 12  # places at which climbers begin
+_COMPARED = 2000  # number of best places compared by `_BESIDE`
+_FEWEST = 12  # least number of starting places, filled up with excluded ones
 COMPETING = 1.9207  # log-likelihood below the maximum within which summits compete: the ratio of 95 %
-_VALLEY = 0.5  # fall on the straight line between two summits that separates them
-_BETWEEN = 12  # places on that line
-_ALIKE, _MOST = 0.02, 12  # share of the ranges within which summits are one; largest number compared
+_VALLEY = 0.5  # fall of log-likelihood on the straight line between two summits that separates them
+_BETWEEN = 12  # places tried on that line
+_ALIKE, _MOST = 0.02, 12  # share of the ranges within which summits are identical; largest number compared
 
 
 def scan(evaluate: Evaluator, count: int) -> None:
@@ -38,7 +38,7 @@ def scan(evaluate: Evaluator, count: int) -> None:
 
 
 def starts(evaluate: Evaluator, count: int) -> Places:
-    """Return the best places of the scan that have no higher one near, as points, filled up where these are few."""
+    """Return, as points, the best scanned places without a higher one nearby; fill up with others if these are few."""
     places, _ = best_scanned(evaluate)
     beside = _has_higher_beside(places, evaluate, _BESIDE)
     wanted = np.concatenate([places[~beside][:count], places[beside][: max(_FEWEST - np.sum(~beside), 0)]])
@@ -53,7 +53,7 @@ def best_scanned(evaluate: Evaluator) -> tuple[Places, Float[np.ndarray, " n"]]:
 
 
 def _has_higher_beside(places: Places, evaluate: Evaluator, distance: float) -> Bool[np.ndarray, " n"]:
-    """Return whether one of the higher places before it is near in every range."""
+    """Return for each place whether a higher place, listed before it, is near in every range."""
     low, high = evaluate.ends
     share = (places - low) / (high - low)
     near = np.max(np.abs(share[:, None] - share[None]), axis=2) < distance
@@ -84,8 +84,10 @@ class Competing(NamedTuple):
 
 
 def competing(evaluate: Evaluator, summits: Summits) -> Competing:
-    """Return summits less than 1.92 below the highest, with a fall of over 1/2 on the straight lines to all higher
-    ones."""
+    """Return summits less than 1.92 below the highest, separated by a fall of over 1/2 from all higher ones.
+
+    The fall is tested on the straight lines between them.
+    """
     order = np.argsort(-summits.values)
     order = order[summits.values[order] > summits.values.max() - COMPETING]
     places, values = evaluate.places(summits.points[order]), summits.values[order]

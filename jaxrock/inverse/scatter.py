@@ -7,17 +7,18 @@ they are interpolated linearly:
     P(stands) = mean over possible rocks of sum_k w_k Phi(y_k/s_k),
 
 The sum is over the quarter points of the intervals between nodes. Here y is a function of the margin that is nearly
-straight in ln amplitude, and w_k the normal probability around the quarter point. The smear s_k is half of the change
+linear in ln amplitude, and w_k the normal probability around the quarter point. The width s_k is half of the change
 of y from node to node; a probit of that width makes the sum smooth.
 
 Nodes are fixed levels of the strength of the motion: a growing motion moves the weights, and not the nodes. So the
 probability is as smooth in the amplitude as the normal distribution, however rough the margin. Overturning sets are
-unions of intervals, some narrower than the distance of nodes. Nodes that moved with the amplitude would flicker through
-these. A fixed node either meets such a narrow set, which then counts as a whole interval, or misses it.
+unions of intervals, some narrower than the distance of nodes. Nodes that moved with the amplitude would enter and leave
+such intervals, and the probability would jump. A fixed node either meets such a narrow set, which then counts as a
+whole interval, or misses it.
 
 Possible rocks are a Latin hypercube (McKay, Beckman & Conover 1979), whose first direction is that in which a rock
-becomes easier to topple. A slenderer rock acts like a stronger motion. So the variance within its strata is added to
-that of the amplitude: the total is right for any number of rocks.
+becomes easier to topple. A slenderer rock acts like a stronger motion. So the variance within the strata of that
+direction is added to that of the amplitude: the total is right for any number of rocks.
 """
 
 import functools
@@ -41,12 +42,12 @@ _LEAST_APART, _MOST_APART = 0.01, 0.8
 _ROCKS, _ROCKS_POWER = 0.045, 1.4  # possible rocks: (0.045/error)^1.4
 _WELL_KNOWN = 10.0  # scatter by rocks over that by motion, per unit of the error, below which one rock suffices
 _REACH = 4.0  # standard deviations to each side that nodes cover
-_SMEAR = 0.5  # of the difference between nodes
-_LEAST_WIDTH = 1e-3
+_SMEAR = 0.5  # width of the probit, over the difference of y between nodes
+_LEAST_WIDTH = 1e-3  # of that probit
 _SLOPE_OVER = 1.2  # standard deviations at each end from which y is extrapolated
-_LEAST_SLOPE = 0.05  # of y by a standard deviation, beyond the last nodes
-_END_WIDTH = 0.1  # of y there, so that the probability is smooth
-_BY_P = 0.5  # a higher p acts like so much of the amplitude: between none for long pulses and all for short ones
+_LEAST_SLOPE = 0.05  # of y by a standard deviation, beyond the outermost nodes
+_END_WIDTH = 0.1  # width of the probit of y beyond these nodes, so that the probability is smooth
+_BY_P = 0.5  # change of ln amplitude with the effect of that of ln p: from 0 for long pulses to 1 for short ones
 _GOLDEN = (np.sqrt(5) - 1) / 2
 _DESIGNS = 200  # number of Latin hypercubes drawn; the least correlated is used
 
@@ -119,7 +120,7 @@ def _quantile(share: np.ndarray) -> np.ndarray:
 
 
 class Levels(NamedTuple):
-    """Nodes, (nodes, ..., possible, rocks): strengths of the motion, and the rocks at each."""
+    """Strengths of the motion at nodes, (nodes, ..., possible, rocks), and the rocks at each."""
 
     strength: Real  # logarithm
     alpha: Real
@@ -140,7 +141,7 @@ def levels_around(
     variance = scatter**2 + quadrature.absorbed * by_rock
     # Linear y through quarter points, with the smear, has a variance larger by this factor.
     spread = 1 + quadrature.apart**2 * (_SMEAR**2 - 1 / 48)
-    # A change of the scatter moves weights, and not the nodes: what the intervals between them add stays, too.
+    # A change of the scatter moves weights, and neither the nodes nor the variance that the intervals add.
     deviation = jnp.sqrt(variance - jax.lax.stop_gradient((1 - 1 / spread) * variance))
     step = quadrature.apart * jax.lax.stop_gradient(deviation)
     strength = strength[..., None, None]
@@ -178,12 +179,12 @@ def are_known_well(observations: Observations, scatter: Real, accuracy: float) -
 
 
 def rocks_at(observations: Observations, offsets: tuple[Real, Real, Real] | Real) -> tuple[Real, Real, Real]:
-    """Alpha, p and restitution of rocks that are off by (3, ..., rocks) in ln alpha, ln p and restitution."""
+    """Return alpha, p and restitution of rocks with offsets, (3, ..., rocks), in ln alpha, ln p and restitution."""
     most = observations.widest
     alpha = jnp.minimum(observations.alpha * jnp.exp(offsets[0]), jnp.maximum(most, observations.alpha))
     p = observations.p * jnp.exp(offsets[1])
     restitution = jnp.where(observations.follows, observations.by_momentum(alpha), observations.restitution)
-    # At 1 impacts never die out.
+    # At a restitution of 1 impacts never die out.
     high = jnp.maximum(jnp.where(observations.restitution_sd > 0, 0.99, 1.0), restitution)
     return alpha, p, jnp.clip(restitution + offsets[2], 0.0, high)
 
@@ -191,12 +192,12 @@ def rocks_at(observations: Observations, offsets: tuple[Real, Real, Real] | Real
 class Possible(NamedTuple):
     """Outcomes of rocks in possible scenes, (scenes, ..., ways, rocks), at the quarter points of intervals.
 
-    The axis of ways holds all that is equally likely of a rock: its orientation, and the possible rocks.
+    The axis of ways holds all equally likely cases of a rock: its orientations, and the possible rocks.
     """
 
-    weight: Real  # probability of the surroundings of each
-    y: Real  # the margin, straightened
-    width: Real  # what it is smeared by
+    weight: Real  # normal probability around each quarter point
+    y: Real  # the margin, transformed to be nearly linear in ln amplitude
+    width: Real  # width of the probit of y
     known: Flags  # whether it was computed
     ends: Real  # y at the first and the last node, its slope beyond, and where they are
     rotation: Real  # [rad]
@@ -219,7 +220,7 @@ class Possible(NamedTuple):
         y, known = _bridged(_straightened(jnp.where(known, margin, 0.0)), known)
         width = jnp.sqrt((_SMEAR * jnp.diff(y, axis=0)) ** 2 + _LEAST_WIDTH**2)
         few = min(max(round(_SLOPE_OVER / apart), 1), len(y) - 1)
-        # As far apart as they are by this scatter: it changes that, and not the nodes.
+        # Distances `where` depend on the scatter, through which slopes have derivatives by it; the nodes are fixed.
         slope = jnp.stack(
             [(y[0] - y[few]) / (where[few] - where[0]), (y[-1 - few] - y[-1]) / (where[-1] - where[-1 - few])]
         )
@@ -233,15 +234,15 @@ class Possible(NamedTuple):
         )  # fmt: skip
 
     def log_probabilities(self, density: Real | None = None) -> Real:
-        """Logarithms of the probability that rocks stand, and that they topple; with a log-density of each part, the
-        ends first and last, also of the first with that: (2 or 3, ..., rocks).
+        """Return the log-probabilities that rocks stand, and that they topple, (2 or 3, ..., rocks).
 
-        All are computed side by side: a program of half the length compiles in half the time.
+        With a log-density of each part, the ends first and last, a third row is standing with that density. All rows
+        are computed together: a program of half the length compiles in half the time.
         """
-        # Of a scene that could not be computed nothing is known: one half, and no slope.
+        # A scene that was not computed counts as one half, without slope.
         inner = jnp.where(self.known, self.y / self.width, 0.0)
-        # A motion that is small enough spares every rock, and one that is large enough topples it. How far away is
-        # that?
+        # A sufficiently small motion spares every rock, and a sufficiently large one topples it: extrapolate y to its
+        # zero beyond the outermost nodes.
         first, last, before, after, below, above = self.ends
         near, far = jnp.stack([first, -last]), jnp.stack([last, -first])
         this = jnp.stack([below, -above])
@@ -264,7 +265,7 @@ class Possible(NamedTuple):
 
 
 def _parted(values: Real, count: int) -> tuple[Real, Real]:
-    """The first along the second axis, and the others."""
+    """Return the first `count` entries along the second axis, and the others."""
     return values[:, :count], values[:, count:]
 
 
@@ -273,46 +274,46 @@ def _rotation(verge: Real, left: Real) -> Real:
 
 
 def _between(values: Real) -> Real:
-    """Values at the quarter points of intervals, (2 intervals, ...), of what is straight between nodes."""
+    """Return linearly interpolated values at the quarter points of intervals, (2 intervals, ...)."""
     pairs = jnp.stack([0.75 * values[:-1] + 0.25 * values[1:], 0.25 * values[:-1] + 0.75 * values[1:]], axis=1)
     return pairs.reshape(-1, *values.shape[1:])
 
 
 def _halves(values: Real) -> Real:
-    """Middles and upper ends of intervals, (2 intervals, ...)."""
+    """Return the middles and upper ends of intervals, (2 intervals, ...)."""
     pairs = jnp.stack([(values[:-1] + values[1:]) / 2, values[1:]], axis=1)
     return pairs.reshape(-1, *values.shape[1:])
 
 
 def _twice(values: Real | Flags) -> Real | Flags:
-    """What intervals have in common, at their quarter points."""
+    """Repeat values of intervals at both of their quarter points."""
     return jnp.repeat(values, 2, axis=0)
 
 
 def _mean_of_ways(logarithms: Real) -> Real:
-    """Of probabilities, by their logarithms (..., ways, rocks): which way a rock was shaken is anybody's guess."""
+    """Return logarithms of mean probabilities over equally likely ways, from logarithms (..., ways, rocks)."""
     count = logarithms.shape[-2]
     return logarithms[..., 0, :] if count == 1 else logsumexp(logarithms, axis=-2) - np.log(count)
 
 
 def _in_front(values: np.ndarray, like: Real) -> np.ndarray:
-    """Values along the first axis of an array."""
+    """Reshape values to broadcast along the first axis of an array."""
     return values.reshape(-1, *[1] * (like.ndim - 1))
 
 
 def _straightened(margin: Real) -> Real:
-    """A function of the margin that is nearly straight in ln amplitude, with slope 1/2 through zero.
+    """Return a function of the margin that is nearly linear in ln amplitude, with slope 1/2 through zero.
 
-    In a free stage the margin is 1 - E/E_crit, and energy goes with the square of the amplitude: -ln(1 - margin)/2 is
-    ln(critical/amplitude) there. Above zero its Taylor polynomial stands for it, because a margin of 1 is not
-    infinitely far away.
+    In a free stage the margin is 1 - E/E_crit, and the energy is proportional to the square of the amplitude:
+    -ln(1 - margin)/2 is ln(critical/amplitude) there. Above zero its Taylor polynomial replaces it, because a margin of
+    1 is not infinitely far away.
     """
     lost = margin < 0
     return jnp.where(lost, -jnp.log1p(-jnp.where(lost, margin, 0.0)) / 2, margin / 2 + margin**2 / 4)
 
 
 def _bridged(values: Real, known: Flags) -> tuple[Real, Flags]:
-    """A single node that could not be computed is the mean of both beside it, as what lies between nodes is."""
+    """Fill a single node that was not computed with the mean of both neighbours, consistent with interpolation."""
     alone = ~known[1:-1] & known[:-2] & known[2:]
     inner = jnp.where(alone, (values[:-2] + values[2:]) / 2, values[1:-1])
     known = jnp.concatenate([known[:1], known[1:-1] | alone, known[-1:]])

@@ -1,7 +1,7 @@
-"""Searches for the maxima of a likelihood from many starts, by own climbers or by optimisers of optax and optimistix.
+"""Search for the maxima of a likelihood from many starts, by the package's BFGS or by optax and optimistix.
 
-Optimisers of other libraries take their steps side by side, in one compiled program, until each of them says that it
-has arrived; where they have been is known afterwards, as it is of own climbers.
+Optimisers of other libraries take their steps side by side, in one compiled program, until each reports convergence.
+Like the package's BFGS, they return the paths of all starts.
 """
 
 from typing import Any
@@ -19,13 +19,13 @@ from jaxrock.numerics.climb import Summits, climb
 
 Real = Inexact[Array, "..."]
 _TOGETHER = 8  # climbers in one call of the compiled program
-_STEPS = 300  # of an optimiser, at most
-_TOLERANCE = 1e-6  # relative and absolute, at which an optimiser of optax has arrived
-_PATIENCE, _LEAST = 40, 1e-7  # steps in which one must gain so much; for those that never say that they have arrived
+_STEPS = 300  # largest number of steps of an optimiser
+_TOLERANCE = 1e-6  # relative and absolute tolerance at which an optimiser of optax has converged
+_PATIENCE, _LEAST = 40, 1e-7  # steps in which the best value must rise by so much; some optimisers never terminate
 
 
 class Trace(eqx.Module):
-    """Where a search from many starts has been; what has ended, or has no motion, is not a number from then on.
+    """The paths of a search from many starts; NaN after the end of a path, and where the motion is impossible.
 
     - `values`: (steps, starts, parameters), in the order of an estimate's `names`, in their units.
     - `log_likelihood`: (steps, starts), with the priors.
@@ -36,7 +36,7 @@ class Trace(eqx.Module):
 
     @classmethod
     def of(cls, evaluate: Evaluator, summits: Summits) -> "Trace":
-        """That of points on the way to summits."""
+        """Return the trace of the points on the way to summits."""
         assert summits.path is not None
         points, values = summits.path
         parameters = evaluate.problem.parameters(evaluate.places(points))
@@ -44,7 +44,7 @@ class Trace(eqx.Module):
 
 
 def optimizer_or_none(name: str, value: Any) -> Any:
-    """An optimiser of optax, or a minimiser of optimistix, or None."""
+    """Check that an argument is an optimiser of optax, a minimiser of optimistix, or None."""
     if value is None or _is_of_optax(value):
         return value
     import optimistix
@@ -60,12 +60,12 @@ def _is_of_optax(value: Any) -> bool:
 
 
 def summits_of(evaluate: Evaluator, starts: np.ndarray, optimizer: Any = None) -> Summits:
-    """Maxima from many starts, by an optimiser; None: own climbers."""
+    """Find maxima from many starts by an optimiser; None: the package's batched BFGS."""
     return climb(evaluate, starts) if optimizer is None else _Foreign.of(optimizer, evaluate).climbed(starts)
 
 
 class _Foreign:
-    """Climbers by a minimiser of optimistix, or of optax within one."""
+    """Climbers that use a minimiser of optimistix, or one of optax wrapped by it."""
 
     def __init__(self, solver: Any, evaluate: Evaluator):
         self.solver, self.evaluate = solver, evaluate
@@ -83,7 +83,7 @@ class _Foreign:
         return cls(optimizer, evaluate)
 
     def climbed(self, starts: np.ndarray) -> Summits:
-        """Where climbers arrive."""
+        """Return the summits at which climbers arrive."""
         parts = [self._together(starts[i : i + _TOGETHER]) for i in range(0, len(starts), _TOGETHER)]
         best, arrived = (np.concatenate([part[i] for part in parts]) for i in (0, 1))
         values, _ = self.evaluate(best)
@@ -92,7 +92,7 @@ class _Foreign:
         return Summits(best, values, arrived & np.isfinite(values), (paths[0], paths[1]))
 
     def _together(self, starts: np.ndarray) -> tuple[np.ndarray, np.ndarray, list, list]:
-        """The best points, whether they are those of climbers that have arrived, and all points and values."""
+        """Climb together; return the best points, whether each climber has converged, and all points and values."""
         count, all_points, all_values = len(starts), [], []
         points = jnp.asarray(np.pad(starts, ((0, _TOGETHER - count), (0, 0)), mode="edge"))
         problem, ends = self.evaluate.problem, jnp.asarray(self.evaluate.ends)
@@ -123,7 +123,7 @@ def _lengthened(path: np.ndarray, steps: int) -> np.ndarray:
 
 
 def _loss_of(problem: Problem, ends: Real):
-    """What is to be made small at a point, and the point and that once more: the end of a step may be another."""
+    """Return the loss at a point; its auxiliary data repeat point and loss, because a step may end elsewhere."""
 
     def loss(point, _):
         low, high = ends
@@ -134,7 +134,7 @@ def _loss_of(problem: Problem, ends: Real):
 
 
 def _each(function):
-    """A function of one climber's point and state, of many."""
+    """Vectorise a function of one climber's point and state over many climbers."""
     return eqx.filter_vmap(function, in_axes=eqx.if_array(0), out_axes=eqx.if_array(0))
 
 

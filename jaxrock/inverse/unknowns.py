@@ -1,4 +1,4 @@
-"""What is looked for: unknown parameters of a motion, their ranges and priors, and the likelihood over them."""
+"""Unknown parameters of a motion, their ranges and priors, and the likelihood over them."""
 
 from collections.abc import Callable
 from typing import Annotated
@@ -21,17 +21,17 @@ Real = Inexact[Array, "..."]
 Flags = Bool[Array, "..."]
 _LANES = 4  # points in one call of the compiled program with slopes
 _SCANNED = 64  # points in one call of the program without slopes
-_FARTHEST = 5.0  # standard deviations from a range that a prior may be: beyond, one of them is a slip
+_FARTHEST = 5.0  # largest distance of a prior from its range, in standard deviations; more suggests a mistake
 
 
 class Unknown(eqx.Module):
-    """A parameter that is looked for, and where.
+    """An unknown parameter: its range and prior.
 
     **Arguments:**
 
     - `low`, `high`: the range, in the unit of the parameter; positive if `log`.
-    - `log`: whether it is searched, and its prior is uniform, in its logarithm (default) or in itself.
-    - `prior`: median and standard deviation of a normal prior on the logarithm (or on itself); None: a uniform one,
+    - `log`: whether the search, and a uniform prior, are in the logarithm of the parameter (default) or in itself.
+    - `prior`: median and standard deviation of a normal prior on the logarithm (or on itself). None: a uniform prior,
       with which the fit is that of maximum likelihood.
 
     **Raises:** ValueError for values outside their ranges, and for a prior more than five standard deviations away from
@@ -83,25 +83,25 @@ class Unknown(eqx.Module):
 
     @property
     def _middle(self) -> Real:
-        """The place of the prior's median."""
+        """Coordinate of the prior's median."""
         median, _ = self._prior
         return jnp.log(median) if self.log else median
 
     @property
     def _away(self) -> Real:
-        """How far the range is from the prior's median, in its standard deviations."""
+        """Distance of the range from the prior's median, in standard deviations of the prior."""
         low, high = self.ends
         return jnp.maximum(low - self._middle, self._middle - high) / self._prior[1]
 
     def log_prior(self, place: Real) -> Real:
-        """Logarithm of the prior's density at a place in the range, but for a constant."""
+        """Return the logarithm of the prior's density at a place in the range, up to a constant."""
         if self.prior is None:
             return jnp.zeros_like(place)
         return -(((place - self._middle) / self.prior[1]) ** 2) / 2
 
 
 class Problem(eqx.Module):
-    """A likelihood and the parameters that are unknown in it; places are their logarithms, or they themselves."""
+    """A likelihood and its unknown parameters; a place holds their logarithms, or the parameters themselves."""
 
     likelihood: Likelihood
     unknowns: dict[str, Unknown]
@@ -123,29 +123,31 @@ class Problem(eqx.Module):
         return jnp.stack([unknown.ends for unknown in self.unknowns.values()])
 
     def current(self) -> "Problem":
-        """The same with motion and model as they are now."""
+        """Return the problem with the current state of motion and model."""
         return eqx.tree_at(lambda problem: problem.likelihood, self, self.likelihood.current(self.names))
 
     def values(self, places: Real) -> dict[str, Real]:
-        """Parameters by name."""
+        """Return the parameters at places, by name."""
         return {
             name: jnp.exp(places[..., i]) if unknown.log else places[..., i]
             for i, (name, unknown) in enumerate(self.unknowns.items())
         }
 
     def parameters(self, places: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
-        """Those at known places, (..., parameters): by NumPy, for which nothing is compiled."""
+        """Return the parameters at concrete places, (..., parameters), by NumPy, which compiles nothing."""
         logs = np.array([unknown.log for unknown in self.unknowns.values()])
         return np.where(logs, np.exp(np.where(logs, places, 0.0)), places)
 
     def log_prior(self, places: Real) -> Real:
-        """Logarithm of the prior's density at places, (..., parameters), but for a constant."""
+        """Return the logarithm of the prior's density at places, (..., parameters), up to a constant."""
         priors = [unknown.log_prior(places[..., i]) for i, unknown in enumerate(self.unknowns.values())]
         return sum(priors[1:], start=priors[0])
 
     def log_density(self, places: Real, slopes: bool = True, wanted: Flags | None = None) -> Real:
-        """Log-likelihood and log-prior (by the places) at places, (..., parameters), or those that are `wanted`; with
-        first derivatives."""
+        """Return log-likelihood plus log-prior, a density over places, at the `wanted` places, (..., parameters).
+
+        It has derivatives if `slopes`.
+        """
         terms = self.likelihood.terms(self.values(places), slopes, wanted)
         return jnp.sum(terms, axis=-1) + self.log_prior(places)
 
@@ -156,7 +158,7 @@ def _batch(problem: Problem, places: Real, wanted: Flags) -> tuple[Real, Real, t
         terms, facts = problem.likelihood.terms_and_facts(problem.values(places), wanted)
         return jnp.sum(terms, axis=-1) + problem.log_prior(places), facts
 
-    # The places do not depend on one another, so that the slopes of the sum are those of each.
+    # Each value depends on its own place alone, so that the gradient of the sum holds the slopes of all values.
     value, back, facts = jax.vjp(density, places, has_aux=True)
     return value, back(jnp.ones_like(value))[0], facts
 
@@ -176,10 +178,10 @@ def densities(problem: Problem, places: np.ndarray, progress: Callable[[int], No
 
 
 class Evaluator:
-    """Values and slopes at any number of points, in batches of one compiled program; it counts.
+    """Evaluates values and slopes at any number of points, in batches of one compiled program, and counts them.
 
-    Points are angles, with places at low + (high - low) (1 + sin angle)/2: all of space is allowed, and a maximum at
-    the end of a range is one like others, where the slope vanishes and the curvature does not.
+    Points are angles, with places at low + (high - low) (1 + sin angle)/2. Every point is allowed. A maximum at the end
+    of a range is an ordinary one, where the slope vanishes and the curvature does not.
     """
 
     def __init__(self, problem: Problem, progress: Callable[[int], None] = lambda more: None):
@@ -187,7 +189,7 @@ class Evaluator:
         self._coarse = eqx.tree_at(lambda it: it.likelihood.quadrature, self.problem, Quadrature.coarse())
         self.ends = np.asarray(problem.ends).T
         self.scanned = np.empty((0, len(problem.names))), np.empty(0)
-        self.known = np.empty((0, len(problem.names))), np.empty(0)  # places and values, of all that it was asked for
+        self.known = np.empty((0, len(problem.names))), np.empty(0)  # places and values of all evaluations with slopes
 
     def __call__(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         values, slopes = self.at(self.places(points))
@@ -195,7 +197,7 @@ class Evaluator:
         return values, slopes * (high - low) * np.cos(points) / 2
 
     def at(self, places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Values and slopes at places, and by them."""
+        """Return values at places, and slopes by the places."""
         values, slopes = in_batches(lambda *part: _batch(self.problem, *part)[:2], places, _LANES, self.progress)
         self.note(places, values)
         return values, slopes
@@ -213,17 +215,17 @@ class Evaluator:
         return few * len(self.scanned[1]) + many * self.count
 
     def note(self, places: np.ndarray, values: np.ndarray) -> None:
-        """Count, and keep, values at places that somebody else has computed."""
+        """Count and store values at places that the caller has computed."""
         self.count += len(places)
         self.known = np.concatenate([self.known[0], places]), np.concatenate([self.known[1], values])
 
     @property
     def lowest(self) -> float:
-        """The lowest value that was met."""
+        """The lowest finite value so far."""
         return float(np.min(self.known[1], initial=np.inf, where=np.isfinite(self.known[1])))
 
     def facts(self, place: np.ndarray) -> tuple[np.ndarray, ...]:
-        """`survival`, share of scenes computed, and `surprise` of the likelihood at a place, (rocks,) each."""
+        """Return `survival`, share of scenes computed, and `surprise` of the likelihood at a place, (rocks,) each."""
         self.count += 1
         return tuple(x[0] for x in in_batches(lambda *part: _batch(self.problem, *part)[2], place[None], _LANES))
 
@@ -244,11 +246,11 @@ class Evaluator:
         return np.std(stands, axis=0, ddof=1), float(np.std(values, ddof=1))
 
     def places(self, points: np.ndarray) -> np.ndarray:
-        """Places of points."""
+        """Return the places of points."""
         low, high = self.ends
         return low + (high - low) * (1 + np.sin(points)) / 2
 
     def points(self, places: np.ndarray) -> np.ndarray:
-        """Points of places, and of those outside the ranges the points at their ends."""
+        """Return the points of places; places outside the ranges are clipped to their ends."""
         low, high = self.ends
         return np.arcsin(np.clip(2 * (places - low) / (high - low) - 1, -1.0, 1.0))
