@@ -1,4 +1,5 @@
 """The command `jaxrock`: one module for each of its commands.
 
-Imports everything. Start with `main`, then `run`; another command is a module like `run`, and its entry in `main`.
+The package imports all others. Start reading with `main`, then `run`. To add a command, write a module like `run`, and
+add an entry in `main`.
 """

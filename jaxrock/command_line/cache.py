@@ -1,4 +1,4 @@
-"""The command `jaxrock cache`: what is kept between sessions."""
+"""The command `jaxrock cache`: compiled programs that are kept between sessions."""
 
 import argparse
 

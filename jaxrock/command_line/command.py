@@ -1,4 +1,4 @@
-"""What a command of `jaxrock` must tell: its name, what it is for, its options, and what it does."""
+"""The interface of a command of `jaxrock`: its name, purpose, options and action."""
 
 import argparse
 from collections.abc import Callable
@@ -10,12 +10,12 @@ from jaxrock.command_line.output import Report
 class Command(NamedTuple):
     """One command.
 
-    - `name`: its word; `purpose`: one line of help.
-    - `add_options`: adds to a parser what only this command has; all that compute have `--model` and `--out`.
-    - `run`: does it, and tells a report what it found, what it wrote, and what was not computed. **Raises:**
-      ValueError or OSError for input that is bad, before anything is written.
+    - `name`: its word on the command line; `purpose`: one line of help.
+    - `add_options`: adds the command's own options to a parser; all commands that compute have `--model` and `--out`.
+    - `run`: runs the command, and reports results, written files and failures. **Raises:** ValueError or OSError for
+      bad input, before it writes anything.
     - `computes`: whether it computes scenes.
-    - `writes`: names of the files that it may write into its folder, for these options.
+    - `writes`: returns the names of files that the command may write into its folder, for given options.
     """
 
     name: str

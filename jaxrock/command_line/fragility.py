@@ -1,4 +1,4 @@
-"""The command `jaxrock fragility`: how probable it is that a block topples, from records that are scaled to levels."""
+"""The command `jaxrock fragility`: the probability that a block topples, from records scaled to levels."""
 
 import argparse
 import csv
@@ -60,7 +60,7 @@ def _run(arguments: argparse.Namespace, report: Report) -> None:
 
 
 def _entries(found: rk.hazard.SimulatedFragility, fits: dict) -> list[Entry]:
-    """Lines of the table."""
+    """Return the lines of the table."""
     unit = found.unit
     again = int(np.sum(~found.monotone))
     entries = [
@@ -95,7 +95,7 @@ def _write(
     found: rk.hazard.SimulatedFragility,
     fit: rk.hazard.LogNormalFragility | None,
 ) -> None:
-    """Tables, the figure, and NRML where there is a fit."""
+    """Write tables, the figure, and NRML if there is a fit."""
     folder: ResultFolder = arguments.out
     header = f"{found.measure},lower,upper"
     write_csv(report, folder, "fragility.csv", header, found.levels, found.lower, found.upper)

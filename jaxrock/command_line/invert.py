@@ -1,4 +1,4 @@
-"""The command `jaxrock invert`: from a table of rocks to the pulse that they allow, with figures and tables."""
+"""The command `jaxrock invert`: estimate the pulse that a table of rocks allows, with figures and tables."""
 
 import argparse
 from collections.abc import Iterator
@@ -18,22 +18,22 @@ from jaxrock.inverse.observations import SEEN, TOPPLED
 from jaxrock.motions.pulses import PULSES, UNITS
 
 _FILES, _WALL = ("estimate.csv", "probabilities.csv", "region.csv", "region.png"), "unexceeded.csv"
-# Of parameters without a default, which are estimated, too.
+# Default ranges of parameters that have no default value, and are therefore estimated, too.
 _RANGES = {"shape": (-6.0, 6.0)}
 
 
 def _estimated(word: str) -> list[str]:
-    """Parameters of a pulse, beyond amplitude and period or duration, that have no default: they are unknowns."""
+    """Return the unknown parameters of a pulse beyond amplitude and period or duration: those without a default."""
     return [name for name, default in other_parameters(PULSES[word]).items() if default is Parameter.empty]
 
 
 def _all_estimated() -> list[str]:
-    """Those of any pulse."""
+    """Return the parameters that are unknown for at least one pulse."""
     return list(dict.fromkeys(name for word in PULSES for name in _estimated(word)))
 
 
 class _Example(argparse.Action):
-    """Print a file of rocks: an option that needs no other."""
+    """Option that prints an example of a file of rocks and exits, without the required arguments."""
 
     def __init__(self, **given):
         super().__init__(nargs=0, **given)
@@ -115,7 +115,7 @@ def _run(arguments: argparse.Namespace, report: Report) -> None:
 
 
 def _unknowns(arguments: argparse.Namespace, priors: dict) -> dict[str, rk.inverse.Unknown]:
-    """What is estimated."""
+    """Return the unknown parameters with their ranges and priors."""
     for name in ("amplitude", "duration"):
         check_range(f"--{name}", getattr(arguments, name))
     for name in _all_estimated():
@@ -145,11 +145,11 @@ def _report_rest(report: Report, status: rk.inverse.EstimateStatus, files: list[
 
 
 def _priors(given: list[list[str]], pulse: str) -> dict[str, tuple[float, float]]:
-    """Median and standard deviation by name."""
+    """Return the median and standard deviation of each prior by name."""
     known = ("amplitude", "duration", *_estimated(pulse))
     priors = {}
     for word, *numbers in given:
-        name = "duration" if word == "period" else word  # as the estimate calls it, if that is a pulse's extent
+        name = "duration" if word == "period" else word  # users may give the name that the estimate prints
         if name not in known:
             raise ValueError(f"Argument `--prior` must name one of {', '.join(known)}, but names {word}.")
         if name in priors:
@@ -173,7 +173,7 @@ def _write(
     region: rk.inverse.FeasibleRegion,
     wall: rk.inverse.Unexceeded | None,
 ) -> list[Path]:
-    """Tables and the figure; return their paths."""
+    """Write tables and the figure; return their paths."""
     files = list(_FILES)
     with folder.whole(files[0]) as aside, aside.open("w", encoding="utf-8") as file:
         print("parameter,unit,value,low,high,low_is_open,high_is_open", file=file)
@@ -210,12 +210,12 @@ def _write(
 
 
 def _rows(estimate: rk.inverse.Estimate) -> Iterator[tuple]:
-    """Name, value, interval and whether its ends are open, of every parameter."""
+    """Iterate over name, value, interval and open ends of all parameters."""
     return zip(estimate.names, *map(np.asarray, (estimate.values, estimate.interval, estimate.open)))
 
 
 def _shapes(observations: rk.inverse.Observations) -> dict[str, np.ndarray]:
-    """Slenderness angles and frequency parameters by column."""
+    """Return slenderness angles and frequency parameters by column."""
     blocks = observations.blocks
     names = ("alpha", "p") if observations.other is None else ("alpha1", "alpha2", "p1", "p2")
     units = {"a": "rad", "p": "rad_per_s"}
@@ -223,7 +223,7 @@ def _shapes(observations: rk.inverse.Observations) -> dict[str, np.ndarray]:
 
 
 def _quoted(name: str) -> str:
-    """A name as a field of a CSV file."""
+    """Quote a name as a field of a CSV file."""
     return '"' + name.replace('"', '""') + '"'
 
 
@@ -243,7 +243,7 @@ def _text(observations: rk.inverse.Observations, estimate: rk.inverse.Estimate, 
 
 
 def _results(observations: rk.inverse.Observations, estimate: rk.inverse.Estimate) -> dict:
-    """The same for programs."""
+    """Return the results for the JSON output, which programs read."""
     seen = np.asarray(observations.seen)
     parameters = {
         name: {"value": value, "unit": UNITS.get(name, ""), "interval_95": interval, "open": open_}

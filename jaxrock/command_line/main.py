@@ -1,4 +1,4 @@
-"""The command line: simulate a block under a record, its spectrum, an overturning map; motions that rocks allow."""
+"""The command line: responses, spectra, overturning maps, fragilities, and motions that rocks allow."""
 
 import argparse
 import contextlib
@@ -24,7 +24,7 @@ from jaxrock.command_line.spectrum import SPECTRUM
 from jaxrock.keeping.compiled import keep_compiled
 from jaxrock.sweeps.devices import use_cpu_devices
 
-# Another command is a module like `run`, and its entry here.
+# To add a command, write a module like `run` and add it here.
 _COMMANDS = {command.name: command for command in (RUN, SPECTRUM, MAP, FRAGILITY, INVERT, CACHE)}
 
 _EXAMPLES = """\
@@ -46,7 +46,7 @@ _EXIT = "exit status: 0 good, 1 something was not computed, 2 bad input, 130 int
 
 
 def _epilog(command: str = "") -> str:
-    """Examples of a command, or of all, and what exit statuses mean."""
+    """Return examples of a command, or of all, and the meaning of exit statuses."""
     lines = [line for line in _EXAMPLES.splitlines() if line.startswith(f"  jaxrock {command}")]
     return "\n".join(["examples:", *lines, "", *([] if command == "cache" else [_RESULTS, ""]), _EXIT])
 
@@ -80,15 +80,15 @@ def main(words: list[str] | None = None) -> int:
 
     **Arguments:**
 
-    - `words`: of the command; None: those that the program was called with.
+    - `words`: of the command; None: those of the process.
 
-    **Returns:** the exit status: 0 good, 1 not computed, 2 bad input; 130 if it is interrupted, and 141 if nobody reads
-    what it says any more.
+    **Returns:** the exit status: 0 good, 1 not computed, 2 bad input, 130 interrupted, 141 if the reader of a pipe has
+    closed it.
     """
     _open_closed_streams()
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors="backslashreplace")  # what it cannot show is no reason to stop
+            stream.reconfigure(errors="backslashreplace")  # else a character outside its encoding would raise
     try:
         return _done(words)
     except KeyboardInterrupt:
@@ -97,7 +97,7 @@ def main(words: list[str] | None = None) -> int:
     except BrokenPipeError:
         drop(sys.stdout)
         return 141
-    except OSError as error:  # help, or an example, that cannot be printed
+    except OSError as error:  # help or an example cannot be printed
         complain(f"error: {error}")
         drop(sys.stdout)
         return 2
@@ -117,7 +117,7 @@ def _done(words: list[str] | None) -> int:
     try:
         arguments = _parser().parse_args(words)
     finally:
-        sys.stdout.flush()  # argparse exits after it has printed help
+        sys.stdout.flush()  # argparse exits after printing help; a failed flush must raise here, not at exit
     command = _COMMANDS[arguments.command]
     report = Report(command.name, arguments.json, arguments.quiet)
     with heard(arguments.quiet, arguments.verbose):
@@ -150,5 +150,5 @@ def _prepare(command: Command, arguments: argparse.Namespace) -> None:
     import matplotlib
 
     matplotlib.use("Agg")
-    with contextlib.suppress(RuntimeError):  # called by a program that computes already
+    with contextlib.suppress(RuntimeError):  # a calling program has already initialised JAX
         use_cpu_devices()

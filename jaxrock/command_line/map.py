@@ -1,4 +1,4 @@
-"""The command `jaxrock map`: who overturns under a pulse, over its frequency and intensity."""
+"""The command `jaxrock map`: overturning of blocks under a pulse, over its frequency and intensity."""
 
 import argparse
 
@@ -17,7 +17,7 @@ from jaxrock.command_line.options import (
 )
 from jaxrock.command_line.output import Entry, Report, check_surface, save, write_csv
 
-# Across and up, and whether they are those of single lobes; the range that is drawn, and what it is.
+# Horizontal and vertical axes: whether they are those of single-lobe pulses, the default range, and the meaning.
 _AXES = {
     "frequency_ratio": (False, (0.3, 8.0), "2 pi/period of the pulse over p"),
     "intensity": (False, (1.02, 10.0), "peak acceleration (amplitude of the pulse) over the uplift threshold"),
@@ -65,7 +65,7 @@ def _run(arguments: argparse.Namespace, report: Report) -> None:
 
 
 def _axes(arguments: argparse.Namespace) -> tuple[bool, dict[str, np.ndarray]]:
-    """The two axes by their names, and whether they are pulse duration and uplift strength."""
+    """Return whether the axes are pulse duration and uplift strength, and both axes by name."""
     given = {name: getattr(arguments, name) for name in _AXES if getattr(arguments, name) is not None}
     kinds = {_AXES[name][0] for name in given} or {False}
     if len(kinds) > 1:

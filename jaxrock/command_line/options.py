@@ -1,4 +1,4 @@
-"""Options that several commands have, and what they stand for."""
+"""Options that several commands share, and the objects that they describe."""
 
 import argparse
 import glob
@@ -15,24 +15,24 @@ from jaxrock.motions.pulses.pulse import AbstractPulse
 
 
 def number(text: str) -> float:
-    """A number in an option; Python reads over underscores in one."""
+    """Parse the number of an option; unlike `float`, refuse underscores between digits."""
     if "_" in text:
         raise ValueError
     return float(text)
 
 
 def model_of(arguments: argparse.Namespace) -> rk.models.AbstractEquation:
-    """The equation of motion."""
+    """Return the equation of motion."""
     return rk.Linear() if arguments.model == "linear" else rk.Housner()
 
 
 def add_restitution(parser: argparse.ArgumentParser) -> None:
-    """Option of the block's restitution."""
+    """Add the option of the block's restitution."""
     parser.add_argument("--restitution", type=number, help="angular velocity after/before impact (default: Housner's)")
 
 
 def add_record(parser: argparse.ArgumentParser) -> None:
-    """A record, and options for files that do not say all."""
+    """Add the record, and options for files that lack time step, unit or column."""
     parser.add_argument(
         "record",
         nargs="?",
@@ -43,7 +43,7 @@ def add_record(parser: argparse.ArgumentParser) -> None:
 
 
 def files_of(words: list[str]) -> list[str]:
-    """Files, those of patterns in order: shells of Windows leave them as they are typed."""
+    """Return the files, with patterns expanded and sorted, because shells of Windows do not expand patterns."""
     found = []
     for word in words:
         found += ([] if Path(word).exists() else sorted(glob.glob(word))) or [word]
@@ -51,14 +51,14 @@ def files_of(words: list[str]) -> list[str]:
 
 
 def add_description(parser: argparse.ArgumentParser) -> None:
-    """Options for files that do not say all."""
+    """Add options for files that lack time step, unit or column."""
     parser.add_argument("--dt", type=number, help="time between samples [s], for files that do not say")
     parser.add_argument("--unit", help="g, m/s2 or cm/s2, for files that do not say")
     parser.add_argument("--column", type=int, help="column of a CSV, or channel of a V1 or V2 file, from 0")
 
 
 def record_of(arguments: argparse.Namespace) -> rk.Record:
-    """The record that was asked for, scaled."""
+    """Return the chosen record, scaled."""
     if arguments.record is None:
         for option in ("dt", "unit", "column"):
             if getattr(arguments, option) is not None:
@@ -72,21 +72,21 @@ def record_of(arguments: argparse.Namespace) -> rk.Record:
 
 
 def extent_of(pulse: type[AbstractPulse]) -> str:
-    """What a pulse calls its second parameter, after the amplitude: "period" or "duration"."""
+    """Return the name of a pulse's second parameter, after the amplitude: "period" or "duration"."""
     return list(signature(pulse).parameters)[1]
 
 
 def other_parameters(pulse: type[AbstractPulse]) -> dict[str, Any]:
-    """Defaults of a pulse's parameters beyond amplitude and period or duration, by name.
+    """Return the defaults of a pulse's parameters beyond amplitude and period or duration, by name.
 
-    `Parameter.empty` for one that has none.
+    A parameter without a default has `Parameter.empty`.
     """
     more = list(signature(pulse).parameters.values())[2:]
-    return {each.name: each.default for each in more if each.kind is not Parameter.KEYWORD_ONLY}  # which `throw` is
+    return {each.name: each.default for each in more if each.kind is not Parameter.KEYWORD_ONLY}  # leaves out `throw`
 
 
 def add_pulse(parser: argparse.ArgumentParser) -> None:
-    """Options of a pulse: which, and its parameters beyond amplitude and period or duration, of every pulse."""
+    """Add options for the kind of pulse, and for all pulses' parameters beyond amplitude and period or duration."""
     parser.add_argument("--pulse", choices=tuple(PULSES), default="sine", help="shape of the pulse (default sine)")
     meant, kinds = {}, {}
     for word, pulse in PULSES.items():
@@ -100,7 +100,7 @@ def add_pulse(parser: argparse.ArgumentParser) -> None:
 
 
 def pulse_of(arguments: argparse.Namespace) -> Callable[..., AbstractPulse]:
-    """What makes the pulse from amplitude [g] and period or duration [s]."""
+    """Return the function that makes the pulse from amplitude [g] and period or duration [s]."""
     pulse = PULSES[arguments.pulse]
     parameters = other_parameters(pulse)
     fixed = {name: 0.0 for name, default in parameters.items() if default is Parameter.empty}
@@ -114,7 +114,7 @@ def pulse_of(arguments: argparse.Namespace) -> Callable[..., AbstractPulse]:
 
 
 def option_of(name: str) -> str:
-    """What an argument is called on the command line."""
+    """Return the name of an argument on the command line."""
     return "--" + name.replace("_", "-")
 
 
@@ -129,20 +129,20 @@ def inputs_of(arguments: argparse.Namespace) -> list[Path]:
 
 
 def as_typed(message: str, arguments: argparse.Namespace) -> str:
-    """A message of the package, with its arguments called as they are typed: `dt` is `--dt`, and None is not given."""
+    """Rewrite a message of the package in terms of options: `dt` becomes `--dt`, and "is None" "is not given"."""
     options = vars(arguments).keys() - _POSITIONAL
     told = re.sub(r"`(\w+)`", lambda found: f"`{option_of(found[1])}`" if found[1] in options else found[0], message)
     return re.sub(r"^(Argument `--.*), but is None\.$", r"\1, but is not given.", told)
 
 
 def check_points(points: int, least: int) -> None:
-    """There are so many points, or more."""
+    """Raise ValueError for fewer points than `least`."""
     if points < least:
         raise ValueError(f"Argument `--points` must be at least {least}, but is {points}.")
 
 
 def check_range(option: str, ends) -> None:
-    """Both ends of a range are positive, finite and in order."""
+    """Raise ValueError unless both ends of a range are positive, finite and in order."""
     low, high = ends
     if not 0 < low <= high < float("inf"):
         raise ValueError(f"Argument `{option}` must be positive, finite and in order, but is {low:g} to {high:g}.")

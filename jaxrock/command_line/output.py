@@ -1,4 +1,4 @@
-"""What commands say and write: aligned tables for people or one JSON object for programs, CSV files, figures."""
+"""Output of commands: aligned tables for people or one JSON object for programs, CSV files, figures."""
 
 import contextlib
 import json
@@ -16,9 +16,9 @@ from jaxrock.command_line.results import ResultFolder
 
 
 class Entry(NamedTuple):
-    """A line of a table: the name that programs know, the one that people read, a value and its unit.
+    """A line of a table: its key in the JSON object, its label for people, a value and its unit.
 
-    `form`: how the value is printed, in Python's language of formats; `shown`: what is printed in its place.
+    `form`: Python's format specification of the value; `shown`: text to print in place of the value.
     """
 
     key: str
@@ -30,7 +30,7 @@ class Entry(NamedTuple):
 
     @property
     def text(self) -> str:
-        """The value as people read it; zero has no minus sign."""
+        """The value as printed for people; zero has no minus sign."""
         if self.shown is not None:
             return self.shown
         text = format(self.value, self.form)
@@ -39,10 +39,10 @@ class Entry(NamedTuple):
 
 
 class Report:
-    """What a command has found, said at once to people, or at its end to programs.
+    """The results of a command, printed at once for people, or at its end for programs.
 
-    `as_json`: one JSON object on the standard output; `quiet`: nothing there. What could not be computed goes to the
-    standard error in any case.
+    `as_json`: print one JSON object to standard output; `quiet`: print nothing there. Failures go to standard error in
+    any case.
     """
 
     def __init__(self, command: str, as_json: bool = False, quiet: bool = False):
@@ -54,14 +54,14 @@ class Report:
         self._units, self._files = {}, []
 
     def title(self, words: str) -> None:
-        """What it is about."""
+        """Set and print the title of the report."""
         self._told["title"] = words
         self.say(words)
 
     def say(self, words: str) -> None:
-        """Print words for people; programs read the same from `results`.
+        """Print words for people; programs read this information from `results`.
 
-        Where printing fails, results are written all the same, and `finished` raises.
+        If printing fails, the command still writes its results, and `finished` raises.
         """
         if self._speaks:
             try:
@@ -70,7 +70,7 @@ class Report:
                 self._speaks, self._unsaid = False, error
 
     def table(self, entries: list[Entry]) -> None:
-        """Names, values and units."""
+        """Record and print names, values and units."""
         self.results |= {entry.key: plain(entry.value) for entry in entries}
         self._units |= {entry.key: entry.unit for entry in entries if entry.unit}
         widths = [max(len(text) for text in column) for column in zip(*((e.label, e.text) for e in entries))]
@@ -79,20 +79,20 @@ class Report:
             self.say(f"  {entry.label:<{widths[0]}}  {entry.text:>{widths[1]}}  {unit}".rstrip())
 
     def wrote(self, path: Path) -> None:
-        """A file is there."""
+        """Record and print that a file was written."""
         self._files.append(str(path))
         self.say(f"wrote {path}")
 
     def failed(self, reason: str) -> None:
-        """Something was not computed: the exit status is 1."""
+        """Record and print a failure to compute, and set the exit status to 1."""
         self._status = 1
         self._told.setdefault("failures", []).append(reason)
         complain(reason)
 
     def finished(self) -> int:
-        """Return the exit status, after printing what is left.
+        """Return the exit status, after printing the JSON object if requested.
 
-        **Raises:** OSError where something could not be printed.
+        **Raises:** OSError if an earlier print failed.
         """
         if self._unsaid is not None:
             raise self._unsaid
@@ -122,7 +122,7 @@ def drop(stream: TextIO) -> None:
 
 
 def plain(value: Any) -> Any:
-    """A value as JSON has it; what is no finite number is null."""
+    """Convert a value to types of JSON; NaN and infinite numbers become null."""
     if isinstance(value, dict):
         return {name: plain(each) for name, each in value.items()}
     if isinstance(value, (list, tuple)):
@@ -151,7 +151,7 @@ def save(report: Report, folder: ResultFolder, name: str, figure) -> None:
 
 
 def check_surface(report: Report, status: rk.Status) -> None:
-    """Some scenes of a surface may not have been computed."""
+    """Report a failure for each kind of scenes of a surface that were not computed."""
     for word in items_of(status):
         kind = getattr(rk.Status, word)
         count = int(np.sum(np.asarray(status == kind)))
@@ -160,14 +160,14 @@ def check_surface(report: Report, status: rk.Status) -> None:
 
 
 class _Once(logging.Handler):
-    """Prints every message of the package once."""
+    """Log handler that prints each message of the package once."""
 
     def __init__(self):
         super().__init__()
         self._said = set()
 
     def emit(self, record):
-        """Print it, if it is new."""
+        """Print a message that was not printed before."""
         words = record.getMessage()
         if words not in self._said:
             self._said.add(words)
@@ -176,7 +176,7 @@ class _Once(logging.Handler):
 
 @contextlib.contextmanager
 def heard(quiet: bool, verbose: bool):
-    """Within it the package is heard: that it compiles, and on demand all that it says of itself."""
+    """Print the package's log to standard error within the context: compilations, and on demand debug messages."""
     logger, handler = logging.getLogger("jaxrock"), _Once()
     before = logger.level
     level = logging.WARNING if quiet else logging.DEBUG if verbose else logging.INFO

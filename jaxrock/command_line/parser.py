@@ -1,4 +1,4 @@
-"""Words and options of the command, read by argparse; what is nearly one is named."""
+"""A parser for words and options of the command, whose errors suggest the nearest known word."""
 
 import argparse
 import re
@@ -8,7 +8,7 @@ from jaxrock._words import meant
 
 
 class Parser(argparse.ArgumentParser):
-    """Argparse's parser, whose errors ask whether the nearest word was meant."""
+    """Argparse's parser, whose errors suggest the nearest known word."""
 
     def error(self, message: str) -> NoReturn:
         choice = re.search(r"invalid choice: '(.*?)' \(choose from (.*)\)", message)
@@ -21,7 +21,7 @@ class Parser(argparse.ArgumentParser):
         super().error(f"{message}.{hint}" if hint else message)
 
     def parse_args(self, args=None, namespace=None):  # type: ignore[override]  # of overloads
-        """As argparse's, but what a command does not know is said with the command's own options."""
+        """Parse as argparse does, but report unknown arguments with the usage of the command itself."""
         found, unknown = self.parse_known_args(args, namespace)
         if unknown:
             self._of(found.command).error(f"unrecognized arguments: {' '.join(unknown)}")

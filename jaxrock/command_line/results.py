@@ -1,8 +1,8 @@
-"""The folder of results: it knows the files that the command wrote there, and replaces no others.
+"""The folder of results: it identifies the files that the command wrote there, and replaces no others.
 
 One file beside the results lists their SHA-256. A line is added before a result gets its name, and none is removed. So
-runs that write into one folder at once, or that are killed, know each other's results. A result that was changed later
-no longer counts as the command's own.
+concurrent or killed runs in one folder recognise each other's results. A result that was changed later no longer counts
+as the command's own.
 """
 
 import contextlib

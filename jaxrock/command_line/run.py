@@ -58,7 +58,7 @@ def _entries(
     result: rk.responses.Outcome,
     response: rk.responses.Response,
 ) -> list[Entry]:
-    """Lines of the table."""
+    """Return the lines of the table."""
     alpha, lost = float(block.alpha), bool(result.overturned)
     ratio, instead = float(result.max_rotation) / alpha, "overturned" if lost else None
 
@@ -83,7 +83,7 @@ def _entries(
 
 
 def _impacts(of_motion: int, of_history: int, duration: float) -> list[Entry]:
-    """The impacts during the motion, and those in the files where these are others."""
+    """Return the number of impacts during the motion, and that of the history in the files if it differs."""
     entries = [Entry("impacts", "impacts during the motion", of_motion)]
     if of_history != of_motion:
         entries.append(Entry("impacts_of_history", f"impacts in {duration:g} s of history", of_history))
@@ -93,7 +93,7 @@ def _impacts(of_motion: int, of_history: int, duration: float) -> list[Entry]:
 def _write(report: Report, folder: ResultFolder, response: rk.responses.Response) -> None:
     """Write files and figures of the response."""
     for ending in _FILMS:
-        folder.discard(_film_of(ending))  # an earlier run may have been of another block
+        folder.discard(_film_of(ending))  # a film of an earlier run may show another block
     write_csv(report, folder, "history.csv", "time_s,rotation_rad,velocity_rad_per_s", response.time,
               response.rotation, response.velocity)  # fmt: skip
     write_csv(report, folder, "impacts.csv", "time_s,velocity_before_rad_per_s", response.impact_times,

@@ -49,7 +49,7 @@ def _run(arguments: argparse.Namespace, report: Report) -> None:
     ])  # fmt: skip
     header = "two_pi_over_p_s,max_rotation_over_alpha,max_velocity_over_p_alpha,impacts,overturned,margin"
     peaks = (result.max_rotation, result.max_velocity, result.impact_count, lost, result.margin)
-    columns = [np.where(known, np.asarray(each, float), np.nan) for each in peaks]  # else they look like results
+    columns = [np.where(known, np.asarray(each, float), np.nan) for each in peaks]  # NaN marks what is not a result
     write_csv(report, arguments.out, "spectrum.csv", header, period, *columns)
     save(report, arguments.out, "spectrum.png", rk.plot.spectrum(result)[0].figure)
     check_surface(report, result.status)

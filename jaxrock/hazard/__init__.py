@@ -1,6 +1,6 @@
-"""How probably a rock topples: fragilities, fitted or simulated, hazard curves, and files of OpenQuake.
+"""The probability that a rock topples: fragilities, fitted or simulated, hazard curves, and files of OpenQuake.
 
-Imports `studies`, `responses`, `sweeps`. Start with `fragility`, then `curves` and `survival`.
+The package imports `studies`, `responses` and `sweeps`. Start reading with `fragility`, then `curves` and `survival`.
 """
 
 from jaxrock._surface import shown as _shown

@@ -1,5 +1,7 @@
-"""Seismic hazard curves: shakings of a site come as a Poisson process, and a curve gives the annual rate of those that
-exceed each level of intensity."""
+"""Seismic hazard curves: annual rates of shakings of a site that exceed levels of intensity.
+
+Shakings follow a Poisson process.
+"""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -31,17 +33,17 @@ _ORDER = 20  # nodes of the quadrature between levels
 class HazardCurve(eqx.Module):
     """Annual rates of shakings that exceed levels of intensity.
 
-    Between levels the rate is a power law (a straight line in log-log). Beyond the levels whose rates are known nothing
-    is made up: shakings weaker than the first do not count, and all that exceed the last count as if they just reached
-    it. `extended` continues the power laws instead.
+    Between levels the rate is a power law (a straight line in log-log). Beyond the levels with known rates the curve is
+    not extrapolated. Shakings weaker than the first level do not count, and all that exceed the last count as if they
+    just reached it. `extended` continues the power laws instead.
 
     **Arguments:**
 
     - `levels`: (n,) intensities, in the unit of the fragilities (peak acceleration: g), positive and rising; n at
       least 2.
-    - `rates`: (n,) exceedances a year, 0 or more, never rising. Not known are the first ones if infinite (the
-      probability was 1 to rounding), and the last ones if zero (it was 0 to rounding).
-    - `measure`: what the levels are, such as "PGA"; a label, which fragilities over another measure refuse.
+    - `rates`: (n,) exceedances a year, 0 or more, never rising. Infinite first rates are unknown (the probability was 1
+      to rounding), and so are zero last rates (it was 0 to rounding).
+    - `measure`: the intensity measure, such as "PGA"; a label. Fragilities over another measure are refused.
 
     Both may have more axes in front, for use under `jax.vmap`.
 
@@ -73,7 +75,7 @@ class HazardCurve(eqx.Module):
         **Arguments:**
 
         - `levels`, `measure`: as in `HazardCurve`.
-        - `probabilities`: (n,) of one exceedance or more in that time, in [0, 1], never rising.
+        - `probabilities`: (n,) of one exceedance or more in the investigation time, in [0, 1], never rising.
         - `investigation_time`: [years], positive.
 
         **Returns:** a `HazardCurve` with the rates -ln(1 - probability)/time of a Poisson process.
@@ -84,12 +86,12 @@ class HazardCurve(eqx.Module):
         time = scalar("investigation_time", positive("investigation_time", investigation_time))
         if is_traced((probabilities, time)):
             return cls(levels, -jnp.log1p(-probabilities) / time, measure)
-        with np.errstate(divide="ignore"):  # a probability of 1 tells no rate
+        with np.errstate(divide="ignore"):  # a probability of 1 gives an infinite rate, which counts as unknown
             return cls(levels, -np.log1p(-np.asarray(probabilities)) / np.asarray(time), measure)
 
     @called_by_users
     def rate(self, level: Values) -> Real:
-        """Annual rate of shakings of intensity `level` or more that the curve knows; of the shape of `level`."""
+        """Return the known annual rate of shakings of intensity `level` or more, in the shape of `level`."""
         check_one(self)
         return self._rate(if_known(at_level, "level", level))
 
@@ -106,23 +108,23 @@ class HazardCurve(eqx.Module):
 
     @called_by_users
     def scaled(self, factor: ArrayLike) -> "HazardCurve":
-        """The curve of a site where every shaking is `factor` times as intense (positive); rates stay."""
+        """Return the curve of a site where every shaking is `factor` times as intense (positive), with equal rates."""
         return scaled(self, scalar("factor", positive("factor", factor)))
 
     @called_by_users
     def extended(self, lowest: ArrayLike, highest: ArrayLike) -> "HazardCurve":
-        """The curve with the power laws of its first and last known interval continued.
+        """Return the curve with the power laws of its first and last known interval continued.
 
-        A hazard curve bends down in log-log. Where it does, the power laws are above it at both ends, so that the
-        toppling rates under the curve and under the extended one lie below and above the true one (of a fragility that
-        grows, and is 0 and 1 beyond `lowest` and `highest`).
+        A hazard curve bends down in log-log. Where it does, the power laws are above it at both ends. The toppling
+        rates under the curve and under the extended one then lie below and above the true one. This holds for a
+        fragility that grows, and is 0 and 1 beyond `lowest` and `highest`.
 
         **Arguments:**
 
         - `lowest`: level to begin at, positive, below the first level.
         - `highest`: level to end at, above the last level.
 
-        **Returns:** a `HazardCurve` with two levels more, all of whose rates are known.
+        **Returns:** a `HazardCurve` with two more levels, and with known rates at all levels.
 
         **Raises:** ValueError for a level that is not beyond the curve, or if fewer than two rates are known.
         """
@@ -135,11 +137,11 @@ class HazardCurve(eqx.Module):
         highest = checked("highest", highest, "be finite and above the last level", lambda x: (x > end) & (x < np.inf))
         low, high = (given(scalar(name, x))[None] for name, x in (("lowest", lowest), ("highest", highest)))
         levels = arrays.concatenate([low, own, high])
-        with np.errstate(over="ignore"):  # it is checked what comes of it
+        with np.errstate(over="ignore"):  # `_continued` checks for overflow
             return HazardCurve(levels, self._continued(levels, arrays, given), self.measure)
 
     def _continued(self, levels, arrays, given):
-        """Rates at levels, the first and the last of which are beyond the curve."""
+        """Return the rates at levels, the first and the last of which are beyond the curve."""
         own = given(self.levels)
         known = arrays.isfinite(given(self.rates)) & (given(self.rates) > 0)
         rates = given(checked("rates", self.rates, "be known at two levels or more", lambda _: known.sum() >= 2))
@@ -147,7 +149,7 @@ class HazardCurve(eqx.Module):
 
         def law(a, b, here):
             exponent = arrays.log(rates[a] / rates[b]) / arrays.log(own[b] / own[a])
-            # Elsewhere it may leave the numbers, and is not asked for.
+            # Elsewhere the power law may overflow, and its value is not used.
             found = rates[a] * (arrays.where(here, levels, own[a]) / own[a]) ** -exponent
             said = "be levels up to which the power laws stay below the largest number"
             return given(checked("lowest` and `highest", found, said, lambda rate: rate < np.inf))
@@ -172,7 +174,7 @@ def scaled(curve: HazardCurve, factor: Number) -> HazardCurve:
 
 
 def power_laws(curve: HazardCurve) -> tuple[Array, Array]:
-    """Of every interval between levels: whether both rates are known, and the exponent of its power law (else 0)."""
+    """Return for each interval between levels whether both rates are known, and the exponent of its law (else 0)."""
     start, end = curve.rates[:-1], curve.rates[1:]
     known = jnp.isfinite(start) & (end > 0)
     fall = jnp.log(jnp.where(known, start, 1.0) / jnp.where(known, end, 1.0))
@@ -180,17 +182,17 @@ def power_laws(curve: HazardCurve) -> tuple[Array, Array]:
 
 
 def shakings(curve: HazardCurve, knots: Inexact[Array, " knots"]) -> tuple[Array, Array]:
-    """Levels, and annual rates of shakings of just these levels, that stand for all shakings of the curve.
+    """Return quadrature levels and annual rates, at which shakings represent all shakings of the curve.
 
-    The integral of a function over the curve is the sum of its values at these levels times their rates, if between
-    levels and knots it is as gentle as a polynomial.
+    The integral of a function over the curve is the sum of its values at these levels times their rates. The function
+    must be close to a low polynomial between levels and knots.
     """
     known, exponents = power_laws(curve)
     points, weights = gauss_legendre(_ORDER)
     logarithms = jnp.log(curve.levels)
     breaks, low, high = jnp.log(knots), logarithms[0], logarithms[-1]
     breaks = jnp.where(breaks <= low, low, jnp.where(breaks >= high, high, breaks))
-    # Of those that come together levels come first, and so in the piece without a length between, which has slopes.
+    # A stable sort puts levels before equal knots; the empty piece between them still has derivatives.
     breaks = jnp.concatenate([logarithms, breaks])
     order = jnp.argsort(breaks, stable=True)
     breaks, passed = breaks[order], jnp.cumsum(order < logarithms.size)[:-1]
@@ -199,7 +201,7 @@ def shakings(curve: HazardCurve, knots: Inexact[Array, " knots"]) -> tuple[Array
     start, exponent = jnp.where(known, curve.rates[:-1], 0.0)[interval], exponents[interval]
     nodes = middle[:, None] + half[:, None] * points
     density = (start * exponent)[:, None] * jnp.exp(-exponent[:, None] * (nodes - logarithms[interval][:, None]))
-    # What exceeds the last known level counts there.
+    # Shakings that exceed the last known level count at that level.
     last = jnp.isfinite(curve.rates) & (curve.rates > 0) & (jnp.append(curve.rates[1:], 0.0) == 0)
     return (
         jnp.concatenate([jnp.exp(nodes).ravel(), curve.levels]),

@@ -1,4 +1,4 @@
-"""Which measure of intensity explains overturning: a probit fit by each, side by side."""
+"""Compare measures of intensity by how well each alone explains overturning, with a probit fit for each."""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import Annotated
@@ -23,19 +23,20 @@ def compare_measures(
     bound: Annotated[str, word_of("lower", "upper")] = "lower",
     errors: Annotated[str, word_of("clusters", "jackknife")] = "clusters",
 ) -> dict[str, np.ndarray]:
-    """How well measures of intensity, each alone, explain what became of the scenes of a suite.
+    """Compare how well measures of intensity, each alone, explain the outcomes of a suite.
 
     **Arguments:**
 
     - `found`: from `suite_outcomes`.
-    - `measures`: as in its `table`.
-    - `bound`: whether what is undecided stood ("lower") or toppled ("upper").
-    - `errors`: as in `fit_probit`; scenes of one record go together.
+    - `measures`: as in `SuiteOutcomes.table`.
+    - `bound`: whether undecided scenes count as standing ("lower") or toppled ("upper").
+    - `errors`: as in `fit_probit`; scenes of one record form a cluster.
 
-    **Returns:** columns for `pandas.DataFrame`, by falling auc: measure; auc (how probably a scene that toppled had
-    more of it than one that stood); median (at which half topple) and dispersion; slope, standard_error, p_value,
-    useless (the slope cannot be told from 0, or falls); log_likelihood; status (a name of `FitStatus`). Numbers of a
-    fit that failed are NaN; where it is "separable" and auc 1, the measure parts what toppled from what stood.
+    **Returns:** columns for `pandas.DataFrame`, by falling auc: measure; auc (probability that a toppled scene had a
+    larger measure than a standing one); median (at which half topple) and dispersion; slope, standard_error, p_value,
+    useless (the slope does not differ significantly from 0, or is negative); log_likelihood; status (a name of
+    `FitStatus`). Numbers of a fit that failed are NaN. Where the status is "separable" and auc 1, the measure separates
+    toppled from standing scenes.
 
     **Raises:** ValueError for outcomes of one record, and as `SuiteOutcomes.table`.
     """
@@ -68,7 +69,7 @@ def _row(name: str, values: np.ndarray, toppled: np.ndarray, clusters: np.ndarra
 
 
 def _auc(values: np.ndarray, toppled: np.ndarray) -> float:
-    """How probably one that toppled has the larger value (a tie counts half): Mann and Whitney's statistic."""
+    """Return the probability that a toppled scene has the larger value (ties count half): Mann-Whitney statistic."""
     from scipy.stats import mannwhitneyu
 
     if toppled.all() or not toppled.any():

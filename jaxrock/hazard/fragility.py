@@ -1,4 +1,4 @@
-"""Fragilities: how probable it is that a rock topples in a shaking of given intensity, and their fit to outcomes."""
+"""Fragilities, the probability that a rock topples in a shaking of given intensity, and their fit to outcomes."""
 
 import abc
 import math
@@ -36,31 +36,31 @@ Real = Inexact[Array, "..."]
 
 
 class AbstractFragility(Owner):
-    """The probability that a rock topples, against the intensity of the shaking: what every fragility offers.
+    """Base class of fragilities: the probability that a rock topples, as a function of the shaking's intensity.
 
-    One of your own needs `__call__`, and `knots` if it is not smooth; it may have a `measure`.
+    A subclass defines `__call__`, and `knots` if it is not smooth; it may have a `measure`.
     """
 
     __repr__ = described
 
     @abc.abstractmethod
     def __call__(self, level: Values) -> Real:
-        """Probability that a shaking of intensity `level` (any shape) topples the rock."""
+        """Return the probability that a shaking of intensity `level` (any shape) topples the rock."""
 
     @property
     def knots(self) -> Inexact[Array, " knots"]:
-        """Levels between which it is smooth, and changes as gently as a low polynomial: integrals are parted there."""
+        """Levels between which the fragility is close to a low polynomial; integrals are split there."""
         return jnp.zeros(0)
 
 
 class LogNormalFragility(AbstractFragility):
-    """The probability grows with the logarithm of the intensity as a normal distribution does.
+    """A fragility that is the cumulative normal distribution of the logarithm of the intensity.
 
     **Arguments:**
 
     - `median`: intensity that topples half of the time, in the unit of the hazard curve, positive.
     - `dispersion`: standard deviation of the logarithm of the intensity that topples [-], positive.
-    - `measure`: what the intensity is, such as "PGA"; a label, which a hazard curve of another measure refuses.
+    - `measure`: the intensity measure, such as "PGA"; a label. Hazard curves of another measure are refused.
 
     **Raises:** ValueError for a value outside its range.
     """
@@ -87,29 +87,29 @@ class LogNormalFragility(AbstractFragility):
 
 
 def lognormal_of(median: Real, dispersion: Real, measure: str) -> LogNormalFragility:
-    """A lognormal fragility of numbers that may be NaN, which the constructor refuses."""
+    """Return a lognormal fragility whose parameters may be NaN, which the constructor refuses."""
     return eqx.tree_at(lambda f: (f.median, f.dispersion), LogNormalFragility(1.0, 1.0, measure), (median, dispersion))
 
 
 @one_program
 def lognormal(level: Real, median: Real, dispersion: Real) -> Real:
-    """Probability that a shaking of an intensity topples, for 0 and infinity too."""
-    none, any_level = level <= 0, level == jnp.inf  # of which logarithms have no slopes
+    """Return the lognormal probability of toppling, also for intensities of 0 and infinity."""
+    none, any_level = level <= 0, level == jnp.inf  # there the logarithm has no finite derivative
     z = jnp.log(jnp.where(none | any_level, 1.0, level) / median) / dispersion
     return jnp.where(none, 0.0, jnp.where(any_level, 1.0, jax.lax.erfc(-z / math.sqrt(2)) / 2))
 
 
 class TabulatedFragility(AbstractFragility):
-    """Probabilities at levels, straight lines over the logarithm of the intensity between them.
+    """A fragility interpolated between probabilities at levels, linearly in the logarithm of the intensity.
 
-    Below the first level nothing topples, above the last one its probability holds: for a fragility that grows, what
-    the table leaves open is never counted as toppling.
+    Below the first level nothing topples; above the last one its probability holds. For a fragility that grows, these
+    rules never overestimate the probability.
 
     **Arguments:**
 
     - `levels`: (n,) intensities, in the unit of the hazard curve, positive and rising; n at least 2.
     - `probabilities`: (n,) of toppling, in [0, 1]; they may rise and fall, as overturning does with amplitude.
-    - `measure`: as of `LogNormalFragility`.
+    - `measure`: as in `LogNormalFragility`.
 
     **Raises:** ValueError for values outside their ranges, or of other shapes.
     """
@@ -137,20 +137,20 @@ class TabulatedFragility(AbstractFragility):
 @one_program
 def _interpolated(level: Real, levels: Real, probabilities: Real) -> Real:
     below, above = level < levels[0], level >= levels[-1]
-    inside = jnp.where(below | above, levels[0], level)  # logarithms of 0 and of infinity have no slopes
+    inside = jnp.where(below | above, levels[0], level)  # logarithms of 0 and infinity have no finite derivatives
     between = jnp.interp(jnp.log(inside), jnp.log(levels), probabilities)
     return jnp.where(below, 0.0, jnp.where(above, probabilities[-1], between))
 
 
 def check_measure(name: str, measure: str, fragility: AbstractFragility) -> None:
-    """That an argument tells the measure of a fragility, as far as both are known."""
+    """Raise ValueError if the measure of an argument differs from that of a fragility, where both are known."""
     own = str(getattr(fragility, "measure", ""))
     if are_different(measure, own):
         raise ValueError(f"Argument `{name}` must be of the fragility's measure, {own}, but is {measure}.")
 
 
 def rising(name: str, value: Values) -> Inexact[Array, "*batch n"]:
-    """Return `value` as an array of two positive levels or more, each above the one before."""
+    """Return `value` as an array of two positive levels or more, each above the preceding one."""
     array = as_real(name, value)
     if array.ndim == 0 or array.shape[-1] < 2 or array.size == 0:
         raise ValueError(f"Argument `{name}` must hold at least two levels, but has shape {array.shape}.")
@@ -163,13 +163,16 @@ def _rises(x):
 
 
 def the_one_before(x, first: float):
-    """Of each value along the last axis, by NumPy of known ones: JAX would compile that for every length."""
+    """Return for each value the preceding one along the last axis, after `first`.
+
+    Concrete values use NumPy, because JAX would compile the operation for each length.
+    """
     arrays = np if isinstance(x, np.ndarray) else jnp
     return arrays.concatenate([arrays.full_like(x[..., :1], first), x[..., :-1]], axis=-1)
 
 
 def rising_list(name: str, value: Values) -> Inexact[Array, " n"]:
-    """The same, of one list."""
+    """Return `value` as `rising` does, but only a list (one axis)."""
     array = rising(name, value)
     if array.ndim > 1:
         raise ValueError(f"Argument `{name}` must be a list of levels, but has shape {array.shape}.")
@@ -177,7 +180,7 @@ def rising_list(name: str, value: Values) -> Inexact[Array, " n"]:
 
 
 def outcomes(toppled: Values, levels: Real, trials: Real) -> Real:
-    """Return `toppled` as numbers, one for each level: how many of `trials`, or a truth value."""
+    """Return `toppled` as numbers, one for each level; `toppled` holds counts out of `trials`, or truth values."""
     if isinstance(toppled, (list, tuple)) and all(isinstance(each, (bool, np.bool_)) for each in toppled):
         toppled = np.asarray(toppled)
     if np.dtype(getattr(toppled, "dtype", float)) == bool:
@@ -188,7 +191,7 @@ def outcomes(toppled: Values, levels: Real, trials: Real) -> Real:
 
 
 def alike(*arrays: Real) -> tuple[Real, ...]:
-    """Arrays in one precision, the highest of theirs."""
+    """Return the arrays in one precision, the highest among them."""
     dtype = jnp.result_type(*arrays)
     return tuple(array.astype(dtype) for array in arrays)
 
@@ -202,7 +205,7 @@ def beside(name: str, array: Real, levels: Real) -> Real:
 
 
 class FitStatus(Enumeration):
-    """What became of a fit; `FitStatus[fit.status]` is the message."""
+    """Result code of a fit; `FitStatus[fit.status]` is the message."""
 
     successful = item("The likelihood has one maximum, and it was found.")
     separable = item(
@@ -221,18 +224,19 @@ class FitStatus(Enumeration):
 
 
 class FragilityFit(AbstractTable):
-    """What `fit_fragility` finds; where `status` is not `FitStatus.successful`, the numbers of the fit are NaN.
+    """The result of `fit_fragility`; where `status` is not `FitStatus.successful`, the numbers of the fit are NaN.
 
     - `fragility`: the `LogNormalFragility` of largest likelihood.
-    - `covariance`: (2, 2) of (ln median, ln dispersion), the inverse of the observed information: good for many
-      outcomes, too narrow for few: `fragility_intervals`.
+    - `covariance`: (2, 2) of (ln median, ln dispersion), the inverse of the observed information. It is good for many
+      outcomes, and too small for few; `fragility_intervals` holds for few.
     - `log_likelihood`: at the maximum, without the binomial coefficients.
     - `highest_survived`, `lowest_toppled`: in the unit of the levels, 0 and infinite if there are none. Where the
       outcomes are separable in the usual order, the median lies between them.
     - `status`: a `FitStatus`.
-    - `p_value`: how probably outcomes that have nothing to do with the levels give such a slope (Rao's score test
-      with the observed information): above 0.05 this measure of intensity is useless here. It holds of separable
-      outcomes, too; 1 where all ended alike; NaN of a simulation of one record, which tells nothing of others.
+    - `p_value`: probability that outcomes independent of the levels give such a slope (Rao's score test with the
+      observed information). Above 0.05 this measure of intensity is useless here. It holds for separable outcomes, too.
+      It is 1 where all outcomes are equal, and NaN for a simulation of one record, which carries no information on
+      others.
     """
 
     fragility: LogNormalFragility
@@ -258,16 +262,16 @@ class FragilityFit(AbstractTable):
 
 
 def fit_fragility(levels: Values, toppled: Values, trials: Values = 1) -> FragilityFit:
-    """The lognormal fragility under which outcomes are most probable (probit regression on the logarithm).
+    """Fit the lognormal fragility under which outcomes are most probable (probit regression on the logarithm).
 
     **Arguments:**
 
     - `levels`: (n,) intensities of the shakings, positive.
     - `toppled`: (n,) 0 or 1 (or False and True) for each shaking; or how many of its `trials` toppled.
-    - `trials`: how many were exposed at each level, (n,) or one number.
+    - `trials`: number of rocks exposed at each level, (n,) or one number.
 
-    **Returns:** a `FragilityFit`, also for data that have no maximum: its status says so. It has derivatives
-    of first order by the data.
+    **Returns:** a `FragilityFit`, also for data without a maximum, which its status reports. It has derivatives of
+    first order by the data.
 
     **Raises:** ValueError for arguments outside their ranges, or of other shapes.
 
@@ -279,7 +283,7 @@ def fit_fragility(levels: Values, toppled: Values, trials: Values = 1) -> Fragil
 
 
 def counted(levels: Values, toppled: Values, trials: Values) -> tuple[Real, Real, Real]:
-    """Levels, how many toppled and how many survived at each, (n,), of what users give."""
+    """Check the user's data; return levels, numbers toppled and numbers that survived, (n,) each."""
     levels = positive("levels", levels)
     if levels.ndim != 1 or levels.size == 0:
         raise ValueError(f"Argument `levels` must be a list of at least one value, but has shape {levels.shape}.")
@@ -306,7 +310,7 @@ def _fit(levels, toppled, survived) -> FragilityFit:
     median = jnp.exp(centre - line[0] * dispersion)
     growing = (line[1] > 0) & (median > 0) & (median < jnp.inf)
     likelihood, _, curvature = probit(z, toppled, survived)
-    # By ln median and ln dispersion; where the slopes add to zero, the curvature of z itself plays no part.
+    # Derivatives by ln median and ln dispersion; at the maximum slopes sum to 0, so second derivatives of z drop out.
     rows = jnp.stack([jnp.full_like(z, 1 / dispersion), z])
 
     status = FitStatus.where(growing, FitStatus.successful, FitStatus.not_growing)

@@ -1,10 +1,11 @@
 """Intervals of fragilities that hold for few shakings and few motions, where standard errors do not.
 
-Independent outcomes: the likelihood with Jeffreys' penalty (half of the logarithm of the information's determinant,
-Firth's way of taking the bias away), profiled. The penalty keeps everything finite, so that outcomes that can be parted
-have intervals, too: any dispersion down to none explains them, and any median between them. Motions at many levels:
-what the pooled outcomes of one motion say of the median is one number a motion, so that Student's t and chi-squared are
-those of as many numbers as there are motions.
+For independent outcomes, intervals come from the profile of the likelihood with Jeffreys' penalty. The penalty is half
+of the logarithm of the information's determinant, and removes the bias (Firth). It keeps all estimates finite, so that
+separable outcomes have intervals, too: any dispersion down to 0 explains them, and any median between them.
+
+For motions at many levels, the pooled outcomes of one motion give one number about the median. Student's t and
+chi-squared therefore have as many observations as there are motions.
 """
 
 from collections.abc import Callable
@@ -20,8 +21,8 @@ from jaxrock._checks import Values, inner_share, scalar
 from jaxrock._tables import AbstractTable, Column
 from jaxrock.hazard.fragility import FitStatus, counted
 
-_FLATTEST = -9.0  # ln of the least slope that is told from none, over the spread of the levels
-_STEEPEST = 40.0  # at which two neighbouring levels are parted
+_FLATTEST = -9.0  # ln of the least slope that is distinguished from 0, times the spread of the levels
+_STEEPEST = 40.0  # slope times the distance of two neighbouring levels, which separates their outcomes
 
 
 class FragilityIntervals(AbstractTable):
@@ -29,8 +30,8 @@ class FragilityIntervals(AbstractTable):
 
     - `confidence`: in (0, 1).
     - `median`: (2,) ends, in the unit of the levels; 0 or infinite where the outcomes leave that side open.
-    - `dispersion`: (2,) ends [-]; infinite where they do not tell the slope from none.
-    - `status`: a `FitStatus`; with any other than successful the ends are NaN.
+    - `dispersion`: (2,) ends [-]; infinite where the outcomes do not distinguish the slope from 0.
+    - `status`: a `FitStatus`; unless it is successful, the ends are NaN.
     """
 
     confidence: float = eqx.field(static=True)
@@ -50,22 +51,22 @@ class FragilityIntervals(AbstractTable):
 def fragility_intervals(
     levels: Values, toppled: Values, trials: Values = 1, *, confidence: ArrayLike = 0.95
 ) -> FragilityIntervals:
-    """Intervals of the lognormal fragility of independent outcomes, which hold for few of them, and for parted ones.
+    """Find intervals of the lognormal fragility of independent outcomes, also for few or separable outcomes.
 
     **Arguments:**
 
     - `levels`, `toppled`, `trials`: as in `fit_fragility`; values, not traced.
     - `confidence`: in (0, 1).
 
-    **Returns:** a `FragilityIntervals`, always with ends: of the profile of the likelihood with Jeffreys' penalty.
-    How often intervals of 95 % held the truth of made samples of 5 to 40 outcomes stands in benchmarks/few_motions.md;
-    of 5 and 10 they are rather too wide than too narrow. The most probable fragility itself is that of `fit_fragility`.
-    For a suite at many levels, whose outcomes are not independent, there is `SimulatedFragility.intervals`.
+    **Returns:** a `FragilityIntervals`, always with ends: of the profile of the likelihood with Jeffreys' penalty. For
+    the coverage of 95 % intervals in synthetic samples of 5 to 40 outcomes, see benchmarks/few_motions.md; for 5 and 10
+    outcomes they are too wide rather than too narrow. `fit_fragility` gives the most probable fragility. Outcomes of a
+    suite at many levels are not independent: use `SimulatedFragility.intervals`.
 
     **Raises:** ValueError for arguments outside their ranges, or of other shapes.
 
-    **Source:** Firth (1993), the penalty; Heinze & Schemper (2002), its profile for outcomes that can be parted;
-    Kosmidis & Firth (2021), why all is finite, for probits, too.
+    **Source:** Firth (1993), the penalty; Heinze & Schemper (2002), its profile for separable outcomes; Kosmidis &
+    Firth (2021), why estimates are finite, for probits, too.
     """
     from scipy.special import chdtri
 
@@ -74,7 +75,7 @@ def fragility_intervals(
     tried = toppled + survived > 0
     logarithms = np.log(levels[tried])
     if np.unique(np.round(logarithms, 9)).size < 2:
-        # One level tells how many topple there, and nothing of how that changes.
+        # Outcomes at one level contain no information on the change between levels.
         anything = jnp.array([0.0, jnp.inf])
         return FragilityIntervals(confidence, anything, anything, FitStatus.successful)
     centre, spread = logarithms.mean(), logarithms.std()
@@ -82,7 +83,7 @@ def fragility_intervals(
     median, slope = _ends(height, chdtri(1, 1 - confidence) / 2)
     with np.errstate(divide="ignore"):
         median, dispersion = np.exp(centre + spread * median), spread / slope[::-1]
-    # The penalty keeps steep slopes out even where outcomes can be parted, which say nothing against them.
+    # The penalty excludes steep slopes even for separable outcomes, which do not contradict them.
     last, first = np.max(levels, where=survived > 0, initial=0.0), np.min(levels, where=toppled > 0, initial=np.inf)
     if last <= first:
         median, dispersion = np.array([min(median[0], last), max(median[1], first)]), np.array([0.0, dispersion[1]])
@@ -90,11 +91,11 @@ def fragility_intervals(
 
 
 def intervals_of_motions(fit, motions: int, confidence: ArrayLike) -> FragilityIntervals:
-    """Intervals from a fit whose covariance takes motions as what is random, with the factor motions/(motions - 1).
+    """Return intervals from a fit whose covariance treats motions as clusters, with the factor motions/(motions - 1).
 
-    The logarithm of the median is a mean over motions: Student's t. Of the squared dispersion, the part that is between
-    motions is their number times the variance of that mean, and has the scatter of a sample's variance; what else there
-    is, is within every motion and known by as many scenes.
+    The logarithm of the median is a mean over motions, with Student's t. The part of the squared dispersion that is
+    between motions is their number times the variance of that mean. It scatters as a sample variance does. The rest is
+    within motions, and its error is neglected because each motion has many scenes.
     """
     from scipy.special import chdtri, stdtrit
 
@@ -112,7 +113,7 @@ def intervals_of_motions(fit, motions: int, confidence: ArrayLike) -> FragilityI
     median = float(fit.fragility.median) * np.exp([-beyond, beyond])
     found = float(fit.fragility.dispersion) ** 2
     between = min(motions * variance, found * motions / freedom)
-    # The likelihood divides by the number of motions: `between`/motions is what that takes away.
+    # The likelihood divides by the number of motions: adding `between`/motions removes that bias.
     ends = found + between * (freedom / chdtri(freedom, [tail, 1 - tail]) - freedom / motions)
     return FragilityIntervals(confidence, jnp.asarray(median), jnp.sqrt(jnp.asarray(ends)), FitStatus.successful)
 
@@ -122,14 +123,14 @@ def _confidence(value: ArrayLike) -> float:
 
 
 class _Height(NamedTuple):
-    """The logarithm of the likelihood of lines, z = intercept + slope abscissa, with Jeffreys' penalty."""
+    """The log-likelihood of lines, z = intercept + slope abscissa, with Jeffreys' penalty."""
 
     abscissas: np.ndarray
     toppled: np.ndarray
     survived: np.ndarray
 
     def __call__(self, intercept: np.ndarray, slope: np.ndarray) -> np.ndarray:
-        """Heights (lines,) of intercepts and slopes (lines,)."""
+        """Return the penalised log-likelihoods, (lines,), of intercepts and slopes, (lines,)."""
         from scipy.special import log_ndtr
 
         z = intercept[:, None] + slope[:, None] * self.abscissas
@@ -139,22 +140,22 @@ class _Height(NamedTuple):
 
     @property
     def range(self) -> tuple[float, float]:
-        """Logarithms of slopes: hardly told from none, and one that parts any neighbours."""
+        """Logarithms of two slopes: one hardly distinguished from 0, and one that separates any neighbours."""
         gaps = np.diff(np.unique(np.round(self.abscissas, 6)))
         return _FLATTEST, float(np.log(_STEEPEST / gaps.min()))
 
     def best_intercept(self, logarithm: float) -> tuple[float, float]:
-        """With one slope; and how high that is."""
+        """Return the best intercept for a slope, given by its logarithm, and the height there."""
         slope = np.exp(logarithm)
         ends = -slope * self.abscissas.max() - 6, -slope * self.abscissas.min() + 6
         return _highest(lambda intercept: self(intercept, np.full_like(intercept, slope)), *ends)
 
     def at_slope(self, logarithm: float) -> float:
-        """The highest with one slope, whatever the median."""
+        """Return the maximum over medians for a slope, given by its logarithm."""
         return self.best_intercept(logarithm)[1]
 
     def at_median(self, median: float) -> float:
-        """The highest with one median, whatever the slope."""
+        """Return the maximum over slopes for a median."""
         flattest, steepest = self.range
 
         def at(logarithm):
@@ -165,9 +166,9 @@ class _Height(NamedTuple):
 
 
 def _log_determinant(weights: np.ndarray, abscissas: np.ndarray) -> np.ndarray:
-    """Logarithms of the determinant of the information of intercept and slope, from logarithms of weights (lines, n).
+    """Return the log-determinant of the information of intercept and slope, from logarithms of weights (lines, n).
 
-    From the largest one, so that a second one that is nothing beside it still counts.
+    Distances are from the abscissa of the largest weight, so that a second weight counts however small it is.
     """
     top = np.argmax(weights, axis=1)[:, None]
     largest = np.take_along_axis(weights, top, 1)
@@ -175,16 +176,18 @@ def _log_determinant(weights: np.ndarray, abscissas: np.ndarray) -> np.ndarray:
     with np.errstate(divide="ignore"):
         squares = shares + 2 * np.log(np.abs(away))
     most = np.max(squares, axis=1, keepdims=True)
-    # Sums over exp(most): of the squares, and of the distances from the largest one's place.
+    # Weighted sums of squares and of distances from that abscissa, scaled by exp(most) to avoid underflow.
     second = np.sum(np.exp(squares - most), axis=1)
     first = np.sum(np.sign(away) * np.exp((squares - most + shares) / 2), axis=1)
     return 2 * largest[:, 0] + most[:, 0] + np.log(np.sum(np.exp(shares), axis=1) * second - first**2)
 
 
 def _highest(height: Callable[[np.ndarray], np.ndarray], low: float, high: float) -> tuple[float, float]:
-    """Where a function of one maximum is highest, and its height there: among a few places, again and again, until
-    these are close together; and last on the parabola through the best three. Both directions are logarithms of slopes
-    or in standard deviations, so that 3e-4 is close."""
+    """Return the place of the maximum of a unimodal function, and its height there.
+
+    The search refines a grid until its places are 3e-4 apart, and ends with the parabola through the best three. Places
+    are logarithms of slopes, or in standard deviations, so that this distance is small.
+    """
     for _ in range(1 + int(np.ceil(np.log((high - low) / 16 / 3e-4) / np.log(8)))):
         places = np.linspace(low, high, 17)
         heights = height(places)
@@ -199,12 +202,12 @@ def _highest(height: Callable[[np.ndarray], np.ndarray], low: float, high: float
 
 
 def _ends(height: _Height, drop: float) -> tuple[np.ndarray, np.ndarray]:
-    """Ends of median and slope, within which the profiles are less than `drop` below the highest place."""
+    """Return the ends of median and slope between which the profiles are less than `drop` below the maximum."""
     from scipy.optimize import brentq, minimize_scalar
 
     flattest, steepest = height.range
     found = minimize_scalar(lambda place: -height.at_slope(place), bounds=(flattest, steepest), method="bounded")
-    # Where outcomes do not rise, no slope that does is as good as none.
+    # Where outcomes do not rise with the level, the flattest slope is the best.
     top, best = max((height.at_slope(place), place) for place in (found.x, flattest))
     centre = -height.best_intercept(best)[0] / np.exp(best)
 

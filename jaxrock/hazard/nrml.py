@@ -30,13 +30,13 @@ def write_nrml(
 
     - `fragilities`: by the names of their limit states, from slight to severe: all `LogNormalFragility`, or all
       `TabulatedFragility` of the same levels.
-    - `path`: the file; one that is there is replaced.
-    - `measure`: as OpenQuake calls it, such as "PGA" [g], "IA" [m/s] or "SA(0.5)" [g]. Of "PGV" and "CAV" [m/s] and
-      "PGD" [m] the file is in cm/s, g s and cm, as OpenQuake has them. It knows no "SV(0.5)".
+    - `path`: the file; an existing one is replaced.
+    - `measure`: OpenQuake's name of it, such as "PGA" [g], "IA" [m/s] or "SA(0.5)" [g]. For "PGV" and "CAV" [m/s] and
+      "PGD" [m] the file is in OpenQuake's units: cm/s, g s and cm. OpenQuake has no "SV(0.5)".
     - `taxonomy`, `description`: of the object.
 
-    OpenQuake draws straight lines between the levels of a table, `TabulatedFragility` straight lines over their
-    logarithms: they differ between levels far apart.
+    OpenQuake interpolates linearly between the levels of a table, `TabulatedFragility` linearly in their logarithms.
+    The two differ between levels far apart.
 
     **Raises:** ValueError for fragilities that do not go together, or of another measure, or spectral velocities;
     OSError if the file cannot be written.
@@ -66,7 +66,7 @@ def write_nrml(
 
 
 def _in_unit(fragility: LogNormalFragility | TabulatedFragility, factor: float):
-    """A fragility over so many times as large numbers."""
+    """Return the fragility with its intensities multiplied by a factor."""
     if isinstance(fragility, LogNormalFragility):
         return LogNormalFragility(factor * fragility.median, fragility.dispersion)
     return TabulatedFragility(factor * fragility.levels, fragility.probabilities)

@@ -32,19 +32,19 @@ _OLD_KIND = re.compile(r"#[\s,\"]*(.*?)[\s,]*\binvestigation_time=")
 # Units of OpenQuake in one of ours, where they differ: its PGV are in cm/s, PGD in cm, and CAV in g s.
 _OF_OURS = {"PGV": 100.0, "PGD": 100.0, "CAV": 1 / GRAVITY}
 
-# Probabilities are computed in single precision from many sources, so that equal ones may differ by a little.
+# OpenQuake computes probabilities in single precision from many sources, so that equal ones may differ slightly.
 _NOISE = 1e-5, 3e-7
 
 
 class HazardCurves(eqx.Module):
-    """Hazard curves of sites, each under one or more branches, as files hold them.
+    """Hazard curves of sites under one or more branches of a logic tree, as read from files.
 
     - `curves`: a `HazardCurve` with arrays of shape (branches, sites, levels), in g for PGA and SA, in m/s for PGV and
       CAV, in m for PGD (of which files have cm/s, g s and cm), and in the unit of the files for others.
     - `longitude`, `latitude`: (sites,) [degrees].
     - `depth`: (sites,) below sea level [km]; 0 where a file has none.
-    - `kinds`: what the files say of each branch, such as "mean", "rlz-000", "quantile-0.5".
-    - `names`: of the sites, or empty strings where they have none.
+    - `kinds`: the kind of each branch as stated in its file, such as "mean", "rlz-000", "quantile-0.5".
+    - `names`: of the sites; empty strings where they have none.
     """
 
     __repr__ = described
@@ -58,7 +58,7 @@ class HazardCurves(eqx.Module):
 
     @arguments
     def at(self, site: int, branch: int | None = None) -> HazardCurve:
-        """The curve of one site, in the order of the files.
+        """Return the curve of one site, in the order of the files.
 
         **Arguments:**
 
@@ -67,7 +67,7 @@ class HazardCurves(eqx.Module):
 
         **Returns:** a `HazardCurve` with arrays of shape (levels,), or (branches, levels).
 
-        **Raises:** ValueError for a site or branch that is not there.
+        **Raises:** ValueError for a site or branch that does not exist.
         """
         for name, index, count in (("site", site, len(self.names)), ("branch", branch or 0, len(self.kinds))):
             whole(name, index, 0, count - 1)
@@ -117,12 +117,12 @@ def read_hazard_curves(paths: str | os.PathLike | Sequence[str | os.PathLike]) -
 
 
 def units_of_openquake(measure: str) -> float:
-    """How many of OpenQuake's units of a measure are one of this package's."""
+    """Return the number of OpenQuake's units of a measure in one unit of this package."""
     return _OF_OURS.get(measure, 1.0)
 
 
 def _read(path: Path) -> dict:
-    """What one file holds: kind, measure, levels, and of its sites names, positions and rates."""
+    """Read one file; return its kind, measure and levels, and names, positions and rates of its sites."""
     name, lines = path.name, text_lines(path)
     time, measure, kind = _comment(name, lines[0])
     columns = next(csv.reader(lines[1:2]), [])
@@ -157,7 +157,7 @@ def _read(path: Path) -> dict:
 
 
 def _comment(name: str, line: str) -> tuple[float, str, str]:
-    """Investigation time [years], measure and kind in the first line."""
+    """Return investigation time [years], measure and kind, from the first line."""
     time, measure, kind = _TIME.search(line), _MEASURE.search(line), _KIND.search(line) or _OLD_KIND.match(line)
     if not line.startswith("#") or not time or not measure or not kind:
         expected = "a comment that states investigation_time and imt, as of hazard curves by OpenQuake"
@@ -168,7 +168,7 @@ def _comment(name: str, line: str) -> tuple[float, str, str]:
 
 
 def _levels(name: str, columns: list[str]) -> np.ndarray:
-    """The levels in the header."""
+    """Return the levels in the header."""
     front = [column for column in columns if not column.startswith(_POE)]
     if columns[: len(front)] != front or not {"lon", "lat"} <= set(front) <= _FRONT:
         expected = "name the columns of hazard curves: lon, lat, depth, poe-0.005 and so on"
@@ -187,7 +187,7 @@ def _numbers(name: str, number: int, fields: list[str]) -> np.ndarray:
 
 
 def _falling(name: str, number: int, probabilities: np.ndarray) -> np.ndarray:
-    """Probabilities that never rise."""
+    """Return probabilities that never rise, after levelling small rises that are rounding."""
     if (probabilities < 0).any() or (probabilities > 1).any():
         raise file_error(name, f"line {number} holds a probability that is not in [0, 1].")
     levelled = np.minimum.accumulate(probabilities)

@@ -1,4 +1,4 @@
-"""Probit fits of outcomes to the logarithms of any number of intensity measures, with errors of few motions, too."""
+"""Probit fits of outcomes to the logarithms of intensity measures, with standard errors also for few motions."""
 
 from collections.abc import Mapping, Sequence
 from typing import Annotated
@@ -20,19 +20,20 @@ from jaxrock.hazard.probit_line import most_clusters, probit, probit_line, slope
 
 
 class ProbitFit(AbstractTable):
-    """What `fit_probit` finds; where `status` is not `FitStatus.successful`, the numbers of the fit are NaN.
+    """The result of `fit_probit`; where `status` is not `FitStatus.successful`, the numbers of the fit are NaN.
 
     P = Phi(intercept + sum of slopes times ln measure).
 
     - `names`: of the measures; `intercept`; `slopes`: (measures,).
-    - `covariance`: (1 + measures, 1 + measures) of the intercept and the slopes; of a jackknife NaN where outcomes can
-      be parted once a cluster is left out, so that a line without it is not known.
+    - `covariance`: (1 + measures, 1 + measures) of the intercept and the slopes. That of a jackknife is NaN where
+      outcomes are separable once a cluster is left out, so that the line without it does not exist.
     - `log_likelihood`: at the maximum, without the binomial coefficients.
-    - `p_values`: (measures,) how probably outcomes that have nothing to do with a measure, given the others, give such
-      a slope (Rao's score test with the observed information, of clusters where there are any); they hold of separable
-      outcomes, too. 1 where nothing could tell a slope: a measure is constant, all ended alike, or others part them.
+    - `p_values`: (measures,) probability of such a slope if outcomes do not depend on the measure, given the others
+      (Rao's score test with the observed information, or with clusters if given). They hold for separable outcomes,
+      too. They are 1 where no slope can be identified: a measure is constant, all outcomes are equal, or the other
+      measures separate them.
     - `falls`: (measures,) whether the mean logarithm of a measure is less where rocks toppled than where they stood.
-    - `status`: a `FitStatus`; of one measure that topples less the stronger it is, successful with a slope below 0.
+    - `status`: a `FitStatus`. For a single measure with which toppling falls, it is successful with a slope below 0.
     """
 
     names: tuple[str, ...] = eqx.field(static=True)
@@ -58,13 +59,16 @@ class ProbitFit(AbstractTable):
 
     @property
     def standard_errors(self) -> Float[Array, " terms"]:
-        """Of the intercept and the slopes."""
+        """Standard errors of the intercept and the slopes."""
         return jnp.sqrt(jnp.diag(self.covariance))
 
     @property
     def useless(self) -> tuple[str, ...]:
-        """Names of measures whose slope cannot be told from 0 (`p_values` above 0.05, or NaN where another says the
-        same or nothing), or is below 0 where there is one measure only: what they say of toppling may be chance."""
+        """Names of measures whose relation to toppling may be chance.
+
+        Their slope does not differ significantly from 0: `p_values` above 0.05, or NaN where measures are equivalent.
+        A single measure with a slope below 0 counts, too.
+        """
         untold = ~(self.p_values <= 0.05)
         if len(self.names) == 1:
             untold |= self.falls
@@ -72,7 +76,7 @@ class ProbitFit(AbstractTable):
 
     @called_by_users
     def __call__(self, **measures: Values) -> Float[Array, "..."]:
-        """Probability to topple at measures by name, positive, which broadcast.
+        """Return the probability to topple at measures by name, positive, which broadcast.
 
         **Raises:** ValueError for other names, or numbers that are not positive.
         """
@@ -101,18 +105,18 @@ def fit_probit(
     clusters: Sequence | np.ndarray | None = None,
     errors: Annotated[str, word_of("information", "clusters", "jackknife")] | None = None,
 ) -> ProbitFit:
-    """The probit line in the logarithms of measures under which outcomes are most probable.
+    """Fit the probit line in the logarithms of measures under which outcomes are most probable.
 
     **Arguments:**
 
     - `measures`: (n,) positive values by name, one measure or more.
     - `toppled`, `trials`: as in `fit_fragility`.
-    - `clusters`: (n,) labels; outcomes of one label are not independent (those of one motion, say).
-    - `errors`: what the covariance is. "information": the inverse of the observed information, for independent
-      outcomes (the default without clusters). "clusters": a sandwich of clusters times C/(C - 1) (the default with
-      them), which is too narrow for few. "jackknife": every cluster (without clusters, every row) left out once, which
-      for few, 10 to 40, is the safer one: somewhat too wide rather than too narrow. NaN where what is left can
-      be parted.
+    - `clusters`: (n,) labels; outcomes of one label are not independent, for example those of one motion.
+    - `errors`: how the covariance is estimated.
+        - "information": the inverse of the observed information, for independent outcomes (default without clusters).
+        - "clusters": a sandwich of C clusters times C/(C - 1) (default with them), too small for few clusters.
+        - "jackknife": every cluster (without clusters, every row) left out once. It is safer for few, 10 to 40:
+          somewhat too large rather than too small. NaN where the remaining outcomes are separable.
 
     **Returns:** a `ProbitFit`.
 
@@ -146,33 +150,36 @@ def fit_probit(
 
 @one_program
 def _logarithms(lists):
-    """Of the measures, in the precision that there is: their sums over outcomes are long."""
+    """Return the logarithms of the measures in the default precision, because sums over outcomes are long."""
     return jnp.log(jnp.stack(lists).astype(jnp.result_type(float)))
 
 
 def or_separable(fit, logarithms, toppled, survived):
-    """A fit, which says so if it failed because a plane parts outcomes, but for those in it: then no line is the best.
+    """Return the fit, with the status `separable` if it failed because a plane separates the outcomes.
 
-    Such a plane is looked for by a linear program: all outcomes on their side of it or in it, as far away as can be.
+    Outcomes in the plane itself do not count. Then no maximum exists. A linear program looks for such a plane: all
+    outcomes on their side of it or in it, with the largest sum of distances.
 
     **Source:** Albert & Anderson (1984), when no maximum exists; Konis (2007), the program.
     """
     if is_traced((fit, logarithms, toppled, survived)) or bool(fit.status == FitStatus.successful):
         return fit
-    from scipy.optimize import linprog  # it takes half a second
+    from scipy.optimize import linprog  # imported here because it takes half a second
 
     rows = np.asarray(logarithms, float)
     rows = rows - rows.mean(axis=1, keepdims=True)
     rows = np.concatenate([np.ones_like(rows[:1]), rows / np.maximum(np.abs(rows).max(axis=1, keepdims=True), 1e-9)])
     sides = np.concatenate([rows[:, np.asarray(toppled) > 0], -rows[:, np.asarray(survived) > 0]], axis=1)
     plane = linprog(-np.sum(sides, axis=1), A_ub=-sides.T, b_ub=np.zeros(sides.shape[1]), bounds=(-1, 1))
-    parted = plane.success and np.max(plane.x @ sides, initial=0.0) > 1e-5  # less is within the program's tolerance
+    parted = plane.success and np.max(plane.x @ sides, initial=0.0) > 1e-5  # less is within the solver's tolerance
     return eqx.tree_at(lambda f: f.status, fit, FitStatus.separable) if parted else fit
 
 
 def inverse_information(rows, curvature, trials):
-    """The covariance of a line by the observed information, and if that is known: it is not where this information is
-    next to none of what outcomes of even odds would be, as it is along a plane that parts them."""
+    """Return the covariance of a line by the observed information, and whether it is reliable.
+
+    It is not where this information is negligible beside that of outcomes of even odds, as along a separating plane.
+    """
     covariance = jnp.linalg.inv(rows @ (-curvature[:, None] * rows.T))
     even = jnp.trace(covariance @ (rows @ (trials[:, None] * rows.T)))
     return covariance, (even > 0) & (even < jnp.finfo(rows.dtype).eps ** -0.75)
@@ -198,12 +205,13 @@ def _fit(logarithms, toppled, survived, labels, count, most: int, errors: str):
             kept = (labels != left_out).astype(toppled.dtype)
             return probit_line(abscissas, toppled * kept, survived * kept)
 
-        lines, found = jax.lax.map(without, jnp.arange(most), batch_size=64)  # without those beyond: as with all
+        # Padding labels name no row: lines without them equal the full fit, and add nothing.
+        lines, found = jax.lax.map(without, jnp.arange(most), batch_size=64)
         off = lines - line
         covariance = jnp.where(jnp.all(found), (count - 1) / count * off.T @ off, jnp.nan)
-    # In the logarithms themselves: intercept = line[0] - sum(line[k] centre[k]/size[k]).
+    # Convert to the logarithms themselves: intercept = line[0] - sum(line[k] centre[k]/size[k]).
     back = jnp.diag(jnp.concatenate([jnp.ones(1), 1 / size])).at[0, 1:].set(-centre / size)
-    # Where outcomes can be parted, probabilities come to 0 or 1 and the line goes on for ever.
+    # For separable outcomes, probabilities approach 0 or 1, and the slopes grow without bound.
     converged &= known & told & (jnp.sum(toppled) > 0) & (jnp.sum(survived) > 0) & (likelihood < -1e-6)
     status = FitStatus.where(converged, FitStatus.successful, FitStatus.not_converged)
     status = FitStatus.where(likelihood >= -1e-6, FitStatus.separable, status)

@@ -1,4 +1,4 @@
-"""Lines of probit regression: how probable outcomes are, the line under which they are most so, and its tests."""
+"""Probit regression: the log-likelihood of outcomes, the maximum-likelihood line, and score tests of its slopes."""
 
 import math
 
@@ -12,9 +12,11 @@ from jaxrock.transforms.elementwise import room_for
 
 
 def with_room(lists, toppled, survived, labels=None):
-    """Known lists of numbers by row, how many toppled and survived, and labels: followed by rows of which nothing ever
-    came, as many as many fits share, so that a few programs serve all. What is traced, or was put on a device, is as it
-    was."""
+    """Pad concrete lists, counts of toppled and survived, and labels with rows whose counts are zero.
+
+    Padding to few common lengths lets a few compiled programs serve fits of all lengths. Inputs that are traced, or on
+    a device, return unchanged.
+    """
     if not is_at_hand((lists, toppled, survived)):
         return lists, toppled, survived, labels
     more = (0, room_for(np.size(toppled)) - np.size(toppled))
@@ -24,12 +26,12 @@ def with_room(lists, toppled, survived, labels=None):
 
 
 def most_clusters(count: int) -> int:
-    """Room for so many clusters: those without a row change nothing."""
+    """Return the padded number of clusters; clusters without a row change nothing."""
     return room_for(count) if count else 0
 
 
 def probit(z, toppled, survived):
-    """Log-likelihood of outcomes with the probability Phi(z), and its first and second derivative by each z."""
+    """Return the log-likelihood of outcomes with probability Phi(z), and its first and second derivatives by each z."""
     signed, counts = jnp.stack([z, -z]), jnp.stack([toppled, survived])
     logarithm = log_ndtr(signed)
     ratio = jnp.exp(-(signed**2) / 2 - logarithm) / math.sqrt(2 * math.pi)
@@ -38,10 +40,9 @@ def probit(z, toppled, survived):
 
 
 def probit_line(abscissas, toppled, survived):
-    """Intercept and slopes of z, by (slopes, n) abscissas, for which outcomes are most probable; and if it was found.
+    """Return the maximum-likelihood intercept and slopes of z, by (slopes, n) abscissas, and whether Newton converged.
 
-    The logarithm of the likelihood is concave, so that a step of Newton's method, cut short where it is too long,
-    always climbs.
+    The log-likelihood is concave, so that a step of Newton's method, shortened where it is too long, always climbs.
     """
 
     def newton(abscissas, slope, curvature):
@@ -55,7 +56,7 @@ def probit_line(abscissas, toppled, survived):
         line, derivatives, _, count = carry
         change = newton(fixed[0], *derivatives)
         candidates = line + shares[:, None] * change
-        # All at every candidate, though only the best one's slopes are needed: `probit` is compiled once.
+        # Derivatives at all candidates, though only those of the best are needed: `probit` is compiled only once.
         climbed, *found = jax.vmap(lambda line: probit(line[0] + line[1:] @ fixed[0], *fixed[1:]))(candidates)
         best = jnp.argmax(climbed)
         return candidates[best], tuple(x[best] for x in found), jnp.max(jnp.abs(change)), count + 1
@@ -65,18 +66,20 @@ def probit_line(abscissas, toppled, survived):
     level = ratio * (fixed[1] - fixed[2]), -(ratio**2) * (fixed[1] + fixed[2])  # derivatives where z is 0
     start = jnp.zeros(1 + len(abscissas), dtype), level, jnp.asarray(jnp.inf, dtype), 0
     line, _, change, _ = jax.lax.while_loop(lambda carry: (carry[2] > tight) & (carry[3] < 50), step, start)
-    # One step more, with derivatives by the data: those of first order are exact.
+    # One more step, through which JAX differentiates by the data: its first derivatives are exact.
     _, *derivatives = probit(line[0] + line[1:] @ abscissas, toppled, survived)
     return line + newton(abscissas, *derivatives), change <= tight
 
 
 def slope_tests(abscissas, toppled, survived, labels=None, count=0, most: int = 0):
-    """How probably outcomes that have nothing to do with an abscissa, given the others, give such a slope: (slopes,).
+    """Return p-values of the slopes, (slopes,): the probability of such a slope if outcomes do not depend on it.
 
-    Rao's score test, with the observed information: at the line without it, whose slope is zero. (A test of the slope
-    in its standard errors finds less the better outcomes are parted.) Of clusters by their labels, of which there are
-    `count`, and room for `most`, by the scatter of their scores. 1 where nothing could tell a slope: an abscissa is
-    constant, all ended alike or are parted by the others, or the scores of each cluster cancel.
+    Each is Rao's score test with the observed information, at the line whose tested slope is zero. (A Wald test loses
+    power the better outcomes are separated.) With `labels`, the scatter of the clusters' scores replaces the
+    information; there are `count` clusters, and room for `most`.
+
+    The p-value is 1 where no slope can be identified: the abscissa is constant, all outcomes are equal or are separated
+    by the other abscissas, or the scores of each cluster cancel.
     """
 
     def test(tested, others):

@@ -1,8 +1,8 @@
-"""Fragility by simulation: what becomes of uncertain blocks under many motions, each scaled to many levels.
+"""Fragility by simulation: outcomes of uncertain blocks under many motions, each scaled to many levels.
 
-Whether a block overturns does not grow with the motion: it may topple at one level and stand at a higher one. The
-verdict of every scene is kept, so that nothing is made monotone before a lognormal curve is asked for; and a scene
-without a verdict bounds the probability from both sides.
+Overturning is not monotone in the level: a block may topple at one level and stand at a higher one. The result keeps
+the verdict of every scene, and only a lognormal fit is monotone. Scenes without a verdict bound the probability from
+both sides.
 """
 
 from collections.abc import Callable, Sequence
@@ -51,7 +51,7 @@ from jaxrock.studies.suite_scenes import (
 
 
 def counts(verdict: np.ndarray, bound: str | None) -> np.ndarray:
-    """How many toppled along the last axis, if all that is undecided stood ("lower") or toppled ("upper")."""
+    """Count toppled scenes along the last axis, with undecided ones as standing ("lower") or toppled ("upper")."""
     undecided = int(np.sum(verdict == UNDECIDED))
     if bound is None and undecided:
         raise ValueError(
@@ -62,14 +62,14 @@ def counts(verdict: np.ndarray, bound: str | None) -> np.ndarray:
 
 
 class SimulatedFragility(AbstractTable):
-    """What became of blocks under scaled motions.
+    """Outcomes of blocks under scaled motions.
 
     - `levels`: (levels,) of the measure; `measure`: its name, "PGA" [g], say.
     - `names`: of the motions; `peak_acceleration` [g], `peak_velocity` [m/s], `strength` (the measure): (motions,)
       before they were scaled; the measure grows with the `power` of the scale.
     - `verdict`: (motions, levels, draws) 1 toppled, 0 stood, -1 undecided (the verdict was too close to call, or could
       not be computed).
-    - `turns`: so many motions, one after the other, are one record at several azimuths.
+    - `turns`: number of consecutive motions that are one record at several azimuths.
     """
 
     levels: Float[Array, " levels"]
@@ -84,7 +84,7 @@ class SimulatedFragility(AbstractTable):
 
     @property
     def unit(self) -> str:
-        """The unit of the levels; empty where it is not known."""
+        """The unit of the levels; empty if unknown."""
         return unit_of(self.measure)
 
     @property
@@ -102,11 +102,11 @@ class SimulatedFragility(AbstractTable):
 
     @called_by_users
     def counts(self, bound: str | None = None) -> Float[np.ndarray, "motions levels"]:
-        """How many draws toppled under every motion at every level.
+        """Return the number of draws that toppled under every motion at every level.
 
         **Arguments:**
 
-        - `bound`: "lower" counts what is undecided as standing, "upper" as toppled. May be left out if nothing is.
+        - `bound`: "lower" counts undecided scenes as standing, "upper" as toppled. None is allowed if there are none.
 
         **Raises:** ValueError if a bound is needed, or is another word.
         """
@@ -114,39 +114,39 @@ class SimulatedFragility(AbstractTable):
 
     @property
     def lower(self) -> Float[np.ndarray, " levels"]:
-        """Share that toppled at every level, over motions and draws, if all that is undecided stood."""
+        """Share that toppled at every level, over motions and draws, if all undecided scenes stood."""
         return np.mean(self.verdict == TOPPLED, axis=(0, 2))
 
     @property
     def upper(self) -> Float[np.ndarray, " levels"]:
-        """The same if all that is undecided toppled."""
+        """Share that toppled at every level, over motions and draws, if all undecided scenes toppled."""
         return np.mean(self.verdict != STOOD, axis=(0, 2))
 
     @called_by_users
     def tabulated(self, bound: str | None = None) -> TabulatedFragility:
-        """Shares at the levels as a fragility, which rises and falls as they do. `bound`: as in `counts`."""
+        """Return the shares at the levels as a fragility, which need not be monotone. `bound`: as in `counts`."""
         motions, _, draws = self.verdict.shape
         return TabulatedFragility(self.levels, self.counts(bound).sum(axis=0) / (motions * draws), self.measure)
 
     @called_by_users
     def fit(self, bound: str | None = None) -> FragilityFit:
-        """The lognormal fragility under which the verdicts are most probable.
+        """Fit the lognormal fragility under which the verdicts are most probable.
 
         **Arguments:**
 
         - `bound`: as in `counts`.
 
-        **Returns:** a `FragilityFit`. Its covariance and `p_value` take records as what is random: what one does at one
-        level, at one azimuth and to one block goes with what it does at others (a sandwich of clusters). Standard
-        errors from it are too small for few records: `intervals` hold. Of one record both are NaN; of records that all
-        did the same the covariance is. Blocks are taken as drawn often enough. Look at `monotone` and `falls` before a
-        curve that only rises is used.
+        **Returns:** a `FragilityFit`. Its covariance and `p_value` treat records as clusters, because outcomes of one
+        record at several levels, azimuths and blocks are correlated. Standard errors from it are too small for few
+        records; `intervals` hold. For one record both are NaN; for records with equal outcomes the covariance is NaN.
+        The sampling error of the drawn blocks is neglected. Check `monotone` and `falls` before you use a monotone
+        curve.
 
         **Raises:** ValueError if a bound is needed.
 
         **Source:** Baker (2015), the fit to stripes; Liang & Zeger (1986), the covariance of clusters.
         """
-        # Scores of what one record does add up, and go with the counts: as if its turns were draws.
+        # Scores of a record add up, and are linear in the counts: the turns of a record may count as draws.
         toppled = self.counts(bound).reshape(self._records, self.turns, -1).sum(axis=1)
         trials = float(self.turns * self.verdict.shape[2])
         fit = fit_fragility(self.levels, toppled.sum(axis=0), self._records * trials)
@@ -162,18 +162,20 @@ class SimulatedFragility(AbstractTable):
 
     @called_by_users
     def intervals(self, bound: str | None = None, confidence: ArrayLike = 0.95) -> FragilityIntervals:
-        """Confidence intervals of the fit's median and dispersion, which hold for few motions: Student's t for the
-        logarithm of the median, chi-squared for the part of the squared dispersion that is between motions.
+        """Return confidence intervals of the fit's median and dispersion, which hold for few motions.
+
+        They use Student's t for the logarithm of the median, and chi-squared for the part of the squared dispersion
+        that is between motions.
 
         **Arguments:**
 
         - `bound`: as in `counts`.
         - `confidence`: in (0, 1).
 
-        **Returns:** a `FragilityIntervals`; NaN with the status of the fit where that failed, of one record only, at
-        however many azimuths, and (`FitStatus.alike`) of records that all did the same.
-        They take the capacities under records as lognormal, as the fit does. How often intervals of 95 % held the truth
-        of made suites of 5 to 40 motions stands in benchmarks/few_motions.md.
+        **Returns:** a `FragilityIntervals`. It is NaN with the status of the fit where that failed, for one record at
+        any number of azimuths, and (`FitStatus.alike`) for records with equal outcomes. Intervals assume lognormal
+        capacities under records, as the fit does. For the coverage of 95 % intervals in synthetic suites of 5 to 40
+        motions, see benchmarks/few_motions.md.
 
         **Raises:** ValueError if a bound is needed, or for a confidence outside its range.
 
@@ -183,7 +185,7 @@ class SimulatedFragility(AbstractTable):
 
     @property
     def _records(self) -> int:
-        """Number of records: of motions that say something of their own."""
+        """Number of records, which are independent; azimuths of one record are not."""
         return len(self.verdict) // self.turns
 
     @property
@@ -193,20 +195,21 @@ class SimulatedFragility(AbstractTable):
 
     @property
     def falls(self) -> Float[np.ndarray, " levels"]:
-        """By how much the share that topples is lower at a level than at some level below it; 0 where it is not."""
+        """Fall of the share that topples at a level from its maximum over lower levels; 0 where it does not fall."""
         return np.maximum.accumulate(self.lower) - self.lower
 
     @property
     def capacities(self) -> Float[np.ndarray, "motions draws 2"]:
-        """Between which levels every block first topples: (below, above), 0 and infinite where that is not known.
+        """Bracket of levels in which each block first topples, (below, above); 0 and infinite where unknown.
 
-        Above the upper level it may stand again. An undecided level may have been the first: it widens the bracket.
+        Above the upper level a block may stand again. An undecided level may be the first that topples it, and widens
+        the bracket.
         """
         return capacities(self.verdict, self.levels)
 
     @called_by_users
     def table(self) -> dict[str, np.ndarray]:
-        """Columns with a row for every motion and level: names, level, peaks [g], [m/s], trials, toppled, undecided."""
+        """Return columns with a row for every motion and level: names, level, peaks [g], [m/s], and counts of draws."""
         motions, levels, draws = self.verdict.shape
         strength = self.strength
         if strength is None:
@@ -225,11 +228,10 @@ class SimulatedFragility(AbstractTable):
 
 @quickly()
 def _clustered(fit: FragilityFit, levels, toppled, draws):
-    """Covariance of (ln median, ln dispersion), and the test of the slope, where what one record (a row) does at all
-    levels is one outcome."""
+    """Return the covariance of (ln median, ln dispersion), and the test of the slope, with each record as a cluster."""
     median, dispersion = fit.fragility.median, fit.fragility.dispersion
     z = jnp.log(levels / median) / dispersion
-    rows = jnp.stack([jnp.full_like(z, -1 / dispersion), -z])  # of z by ln median and ln dispersion
+    rows = jnp.stack([jnp.full_like(z, -1 / dispersion), -z])  # derivatives of z by ln median and ln dispersion
     scores = jax.vmap(lambda toppled: rows @ probit(z, toppled, draws - toppled)[1])(toppled)
     motions = toppled.shape[0]
     abscissas = jnp.tile(jnp.log(levels), motions)[None]
@@ -257,19 +259,19 @@ def simulated_fragility(
 
     - `block`: a `Block` or `AsymmetricBlock`; with parameters of shape (draws,) uncertain, such as `draw_blocks` and
       `draw_rocks` make.
-    - `motions`: a `Suite`, or what makes one, of motions that differ.
+    - `motions`: a `Suite`, or a list of motions; all must differ.
     - `levels`: (levels,) of the measure, positive and rising; two or more.
-    - `facing`: "one": as it stands; "both": also turned round, as draws after those that are not, where nobody knows
-      which way the motion comes.
+    - `facing`: "one": as it stands; "both": also turned round, for a motion of unknown direction. Turned blocks are
+      further draws after the others.
     - `model`, `engine`, `progress`: as in `rocking_spectrum`.
-    - `measure`: what the levels are: "PGA" [g], "PGV" [m/s], "PGD" [m], "IA" (Arias) or "CAV" [m/s], "SA(0.5)" [g] or
+    - `measure`: that of the levels: "PGA" [g], "PGV" [m/s], "PGD" [m], "IA" (Arias) or "CAV" [m/s], "SA(0.5)" [g] or
       "SV(0.5)" [m/s] at a period [s]; or a function of a motion that grows as a power of its scale, such as
       `lambda m: rk.intensity.average_spectral_acceleration(m, [0.2, 0.5, 1.0])`.
 
     **Returns:** a `SimulatedFragility`: its `tabulated()` and `fit().fragility` go into `toppling_rate` and
     `survival_probability` with a hazard curve of the same measure.
 
-    **Raises:** ValueError for arguments outside their ranges, and for a motion that is there twice.
+    **Raises:** ValueError for arguments outside their ranges, and for a repeated motion.
 
     **Source:** Vamvatsikos & Cornell (2002), scaled records; Jalayer & Cornell (2009), stripes.
     """
@@ -292,5 +294,5 @@ def simulated_fragility(
 
 
 def _factors(levels, strength, power: float) -> np.ndarray:
-    """By how much every motion is scaled at every level."""
+    """Return the scale factor of every motion at every level."""
     return (np.asarray(levels)[None, :] / np.asarray(strength)[:, None]) ** (1 / power)

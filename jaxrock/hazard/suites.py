@@ -1,7 +1,7 @@
-"""Outcomes of a suite: as recorded, or at many scales (incremental dynamic analysis), both ways round, on many blocks.
+"""Outcomes of many blocks under a suite of motions, as recorded or scaled (incremental dynamic analysis).
 
-Overturning does not grow with the scale: a block may topple at one and stand at a higher one. Curves are kept as they
-are, and what is undecided bounds every share from both sides.
+Overturning is not monotone in the scale: a block may topple at one and stand at a higher one. Curves are not made
+monotone, and undecided scenes bound every share from both sides.
 """
 
 import warnings
@@ -40,14 +40,14 @@ from jaxrock.studies.suite_scenes import (
 
 
 class SuiteOutcomes(AbstractTable):
-    """What became of blocks under the motions of a suite.
+    """Outcomes of blocks under the motions of a suite.
 
     - `suite`, `blocks` (with parameters of shape (blocks,)), `scale`: (scales,); `facing`: (facings,) 1 as recorded, -1
-      the other way round.
+      turned round.
     - `verdict`: (motions, scales, facings, blocks) 1 toppled, 0 stood, -1 undecided.
-    - `rotation`: the same shape, peak rotation over slenderness (of an asymmetric block over the smaller one); infinite
-      if it toppled, NaN where undecided.
-    - `margin`: the same, as in `Outcome`; NaN where undecided.
+    - `rotation`: in the shape of `verdict`, peak rotation over slenderness (of an asymmetric block over the smaller
+      one); infinite if it toppled, NaN where undecided.
+    - `margin`: in the shape of `verdict`, as in `Outcome`; NaN where undecided.
     """
 
     suite: Suite
@@ -73,51 +73,52 @@ class SuiteOutcomes(AbstractTable):
 
     @called_by_users
     def reaches(self, state: Values) -> tuple[np.ndarray, np.ndarray]:
-        """Shares of blocks, both ways round, that come to damage states, for every motion and scale.
+        """Return shares of blocks, over both facings, that reach damage states, for every motion and scale.
 
         **Arguments:**
 
-        - `state`: (states,) peak rotations over slenderness, positive; one that toppled has reached all.
+        - `state`: (states,) peak rotations over slenderness, positive; a block that toppled has reached all.
 
-        **Returns:** bounds (motions, scales, states): of what is undecided nothing, or all.
+        **Returns:** lower and upper bounds, (motions, scales, states): none, or all, of the undecided scenes count.
 
         **Raises:** ValueError for states that are not a list of positive numbers.
         """
         states = np.asarray(positive("state", state), float)
         if states.ndim != 1 or states.size == 0:
             raise ValueError(f"Argument `state` must be a list of states, but has shape {states.shape}.")
-        found = self.rotation[..., None] >= states  # not where it is not a number
+        found = self.rotation[..., None] >= states  # False where the rotation is NaN
         bounds = found, found | (self.verdict == UNDECIDED)[..., None]
         return tuple(each.mean(axis=(2, 3)) for each in bounds)
 
     @property
     def capacity(self) -> Float[np.ndarray, "motions facings blocks 2"]:
-        """Between which scales every block first topples: (below, above), 0 and infinite where that is not known.
+        """Bracket of scales in which each block first topples, (below, above); 0 and infinite where unknown.
 
-        Above the upper scale it may stand again. An undecided scale may have been the first: it widens the bracket.
+        Above the upper scale a block may stand again. An undecided scale may be the first that topples it, and widens
+        the bracket.
         """
         return capacities(self.verdict, self.scale)
 
     @property
     def comes_back(self) -> np.ndarray:
-        """(motions, facings, blocks) whether a block stands at a scale above one that topples it."""
+        """Truth values (motions, facings, blocks): a block stands at a scale above one that topples it."""
         return comes_back(self.verdict)
 
     @called_by_users
     def table(self, measures: Mapping[str, str | Callable] | Sequence[str] | None = None) -> dict[str, np.ndarray]:
-        """Columns with a row for every scene: `pandas.DataFrame(found.table())`.
+        """Return columns with a row for every scene: `pandas.DataFrame(found.table())`.
 
         **Arguments:**
 
-        - `measures`: names as in `simulated_fragility`, such as `["IA", "SA(0.5)"]`, or such names or functions of a
-          motion by the names of their columns, such as `{"Arias": rk.intensity.arias}`; each is taken of the motion as
-          it was scaled. None: none beside the peaks.
+        - `measures`: names as in `simulated_fragility`, such as `["IA", "SA(0.5)"]`, or a mapping of column names to
+          such names or to functions of a motion, such as `{"Arias": rk.intensity.arias}`. Each is evaluated for the
+          scaled motion. None: only the peaks.
 
         **Returns:** motion, (of components: source and azimuth [rad],) scale, facing, block, the block's parameters
-        (but for what all blocks share), PGA [g], PGV [m/s], the measures, rotation_over_alpha, margin, verdict (1
+        (except those that all blocks share), PGA [g], PGV [m/s], the measures, rotation_over_alpha, margin, verdict (1
         toppled, 0 stood, -1 undecided).
 
-        **Raises:** ValueError for measures that are no functions, or other names, and for names that are there twice.
+        **Raises:** ValueError for measures that are neither functions nor known names, and for repeated names.
         """
         kinds = measures_by_name(measures)
         motion, scale, facing, block = (places.ravel() for places in np.indices(self.verdict.shape))
@@ -139,7 +140,7 @@ class SuiteOutcomes(AbstractTable):
 
 
 def measures_by_name(measures) -> dict[str, Measure]:
-    """Measures by the names of their columns."""
+    """Return the measures by the names of their columns."""
     if measures is None:
         return {}
     if isinstance(measures, Mapping):
@@ -165,19 +166,18 @@ def suite_outcomes(
     engine: AbstractEngine | None = None,
     progress: bool | None = None,
 ) -> SuiteOutcomes:
-    """What becomes of blocks under the motions of a suite, as recorded or at many scales.
+    """Compute the outcomes of blocks under the motions of a suite, as recorded or at many scales.
 
     **Arguments:**
 
-    - `block`: a `Block` or `AsymmetricBlock`; with parameters of shape (blocks,) many.
-    - `motions`: a `Suite`, or what makes one; `Suite(components, azimuth=...)` of records with two components.
+    - `block`: a `Block` or `AsymmetricBlock`, of scalars or with parameters of shape (blocks,).
+    - `motions`: a `Suite`, or a list of motions; `Suite(components, azimuth=...)` for records with two components.
     - `scale`: factors on all motions, a number (1: as recorded) or a list, positive and rising.
     - `facing`: "one": as it stands; "both": also turned round, which for a symmetric block of one
       restitution is a mirror image.
     - `model`, `engine`, `progress`: as in `rocking_spectrum`.
 
-    **Returns:** a `SuiteOutcomes`; `fit_probit` takes columns of its `table()`. It warns of a motion that is there
-    twice.
+    **Returns:** a `SuiteOutcomes`; `fit_probit` takes columns of its `table()`. A repeated motion causes a warning.
 
     **Raises:** ValueError for arguments outside their ranges.
 

@@ -1,7 +1,7 @@
-"""Fragility surfaces: how probable it is that a rock topples, against peak acceleration and PGV/PGA.
+"""Fragility surfaces: the probability that a rock topples, over peak acceleration and PGV/PGA.
 
-Peak acceleration alone says whether a block uplifts, the ratio of peak velocity to peak acceleration for how long it is
-pushed: together they say most of what a motion does to a rock.
+Peak acceleration alone decides whether a block uplifts. The ratio of peak velocity to peak acceleration measures the
+duration of the push. Together they explain most of a motion's effect on a rock.
 """
 
 import inspect
@@ -75,7 +75,7 @@ class SurfaceFragility(eqx.Module):
 
     @called_by_users
     def __call__(self, acceleration: Values, ratio: Values) -> Inexact[Array, "..."]:
-        """Probability to topple at peak accelerations [g] and PGV/PGA [s], which broadcast."""
+        """Return the probability to topple at peak accelerations [g] and PGV/PGA [s], which broadcast."""
         acceleration, median = if_known(level, "acceleration", acceleration), self._median(ratio)
         check_shapes(acceleration=acceleration, ratio=median)
         return lognormal(acceleration, median, self.dispersion)
@@ -85,12 +85,12 @@ class SurfaceFragility(eqx.Module):
 
     @called_by_users
     def at(self, ratio: ArrayLike) -> LogNormalFragility:
-        """The fragility in peak acceleration of motions of one PGV/PGA [s]."""
+        """Return the fragility in peak acceleration for motions of one PGV/PGA [s]."""
         return LogNormalFragility(self._median(ratio), self.dispersion, "PGA")
 
     @called_by_users
     def acceleration(self, probability: Values, ratio: Values) -> Inexact[Array, "..."]:
-        """The peak acceleration [g] at which the rock topples with a given probability in (0, 1): a contour."""
+        """Return the peak acceleration [g] at which the rock topples with a probability in (0, 1): a contour."""
         probability, median = inner_share("probability", probability), self._median(ratio)
         check_shapes(probability=probability, ratio=median)
         return _reached(probability, median, self.dispersion)
@@ -103,16 +103,16 @@ def _power(factor, ratio, exponent):
 
 @one_program
 def _reached(probability, median, dispersion):
-    """Where a lognormal distribution has a probability."""
+    """Return the quantile of a lognormal distribution."""
     return median * jnp.exp(dispersion * jax.scipy.special.ndtri(probability))
 
 
 class SurfaceFit(eqx.Module):
-    """What `fit_surface` finds; where `status` is not `FitStatus.successful`, the numbers of the fit are NaN.
+    """The result of `fit_surface`; where `status` is not `FitStatus.successful`, the numbers of the fit are NaN.
 
     - `fragility`: the `SurfaceFragility` of largest likelihood.
-    - `covariance`: (3, 3) of (ln median, exponent, ln dispersion): the inverse of the observed information; where
-      clusters are told, a sandwich of theirs.
+    - `covariance`: (3, 3) of (ln median, exponent, ln dispersion): the inverse of the observed information, or a
+      sandwich of the clusters if these are given.
     - `status`: a `FitStatus`.
     """
 
@@ -131,13 +131,13 @@ def fit_surface(
     trials: Values = 1,
     clusters: Sequence | np.ndarray | None = None,
 ) -> SurfaceFit:
-    """The two-measure lognormal fragility under which outcomes are most probable (probit regression).
+    """Fit the two-measure lognormal fragility under which outcomes are most probable (probit regression).
 
     **Arguments:**
 
     - `acceleration`, `ratio`: (n,) peak accelerations [g] and PGV/PGA [s] of the shakings, positive.
     - `toppled`, `trials`: as in `fit_fragility`.
-    - `clusters`: (n,) labels; outcomes of one label are not independent (those of one record, say).
+    - `clusters`: (n,) labels; outcomes of one label are not independent, for example those of one record.
 
     **Returns:** a `SurfaceFit`.
 
@@ -179,8 +179,10 @@ def _clustered(covariance, scores, labels, count: ArrayLike, most: int) -> Float
 
 @quickly()
 def _fit(acceleration, ratio, toppled, survived):
-    """The fit, the derivatives of every outcome's log-likelihood by (ln median, exponent, ln dispersion), and the
-    logarithms of the measures."""
+    """Return the fit, the scores of all outcomes, and the logarithms of the measures.
+
+    Scores are derivatives of the log-likelihood by (ln median, exponent, ln dispersion).
+    """
     measures = jnp.log(jnp.stack([acceleration, ratio]))
     centre = jnp.mean(measures, axis=1, keepdims=True)
     size = jnp.std(measures, axis=1, keepdims=True)
@@ -207,14 +209,15 @@ def _fit(acceleration, ratio, toppled, survived):
 
 @arguments
 def surface_of(found: SimulatedFragility, bound: str | None = None) -> SurfaceFit:
-    """The two-measure fragility of scaled motions, each of which has a PGV/PGA of its own.
+    """Fit the two-measure fragility of scaled motions, each of which has its own PGV/PGA.
 
     **Arguments:**
 
     - `found`: from `simulated_fragility`, under motions of different PGV/PGA.
     - `bound`: as in `SimulatedFragility.counts`.
 
-    **Returns:** a `SurfaceFit`, records taken as clusters (at all of their azimuths); of one its covariance is NaN.
+    **Returns:** a `SurfaceFit`. Each record, at all of its azimuths, is a cluster. For one record the covariance is
+    NaN.
 
     **Raises:** ValueError if a bound is needed.
     """
@@ -226,7 +229,7 @@ def surface_of(found: SimulatedFragility, bound: str | None = None) -> SurfaceFi
 
 
 def _of_clusters(acceleration, ratio, toppled, trials, clusters: np.ndarray) -> SurfaceFit:
-    """As `fit_surface`; of one cluster, too, whose covariance nothing tells."""
+    """Fit as `fit_surface` does, and also one cluster, for which the covariance is unknown (NaN)."""
     if clusters.max() > 0:
         return fit_surface(acceleration, ratio, toppled, trials, clusters)
     fit = fit_surface(acceleration, ratio, toppled, trials)
@@ -234,11 +237,11 @@ def _of_clusters(acceleration, ratio, toppled, trials, clusters: np.ndarray) -> 
 
 
 class SimulatedSurface(eqx.Module):
-    """What became of blocks under pulses, over peak acceleration and PGV/PGA.
+    """Outcomes of blocks under pulses, over peak acceleration and PGV/PGA.
 
     - `acceleration`: (rows,) [g]; `ratio`: (columns,) PGV/PGA [s].
     - `verdict`: (pulses, rows, columns, draws) 1 toppled, 0 stood, -1 undecided.
-    - `ways`: 2 where the second half of the draws are the blocks of the first, turned round.
+    - `ways`: 2 if the second half of the draws are the blocks of the first half, turned round.
     """
 
     __repr__ = described
@@ -250,12 +253,12 @@ class SimulatedSurface(eqx.Module):
 
     @property
     def lower(self) -> Float[np.ndarray, "rows columns"]:
-        """Shares that toppled, if all that is undecided stood."""
+        """Shares that toppled if all undecided scenes stood."""
         return np.mean(self.verdict == TOPPLED, axis=(0, 3))
 
     @property
     def upper(self) -> Float[np.ndarray, "rows columns"]:
-        """The same if all that is undecided toppled."""
+        """Shares that toppled if all undecided scenes toppled."""
         return np.mean(self.verdict != STOOD, axis=(0, 3))
 
     @property
@@ -265,12 +268,12 @@ class SimulatedSurface(eqx.Module):
 
     @arguments
     def at(self, ratio: ArrayLike, upper: bool = False) -> TabulatedFragility:
-        """The fragility in peak acceleration at one PGV/PGA [s], between columns by straight lines in its logarithm.
+        """Return the fragility in peak acceleration at one PGV/PGA [s], interpolated linearly in its logarithm.
 
         **Arguments:**
 
         - `ratio`: within the columns.
-        - `upper`: whether to count what is undecided as toppled.
+        - `upper`: whether to count undecided scenes as toppled.
 
         **Raises:** ValueError for a ratio outside the columns.
         """
@@ -284,15 +287,14 @@ class SimulatedSurface(eqx.Module):
 
     @called_by_users
     def fit(self, bound: str | None = None) -> SurfaceFit:
-        """The two-measure lognormal fragility of all cells: a smooth summary.
+        """Fit the two-measure lognormal fragility of all cells: a smooth summary.
 
         **Arguments:**
 
         - `bound`: as in `SimulatedFragility.counts`.
 
-        **Returns:** a `SurfaceFit`. Draws are taken as what is random (clusters; both ways round together): its
-        covariance tells how far their number lets the fit be known, for the pulses as they are; of a single block it is
-        not known, and NaN.
+        **Returns:** a `SurfaceFit`. Each draw, with both of its facings, is a cluster. The covariance measures the
+        sampling error of the draws, for the given pulses; for a single block it is NaN.
         """
         toppled = counts(np.moveaxis(self.verdict, 0, -1), bound)  # (rows, columns, draws), of all pulses
         toppled = toppled.reshape(*toppled.shape[:2], self.ways, -1).sum(axis=2)
@@ -320,8 +322,8 @@ def simulated_surface(
     **Arguments:**
 
     - `block`, `facing`: as in `simulated_fragility`.
-    - `pulses`: make motions of amplitude [g] and period or duration [s], to which their peaks are proportional: of the
-      first the acceleration, of both the velocity. All have one weight.
+    - `pulses`: functions that make motions from amplitude [g] and period or duration [s]. Peak acceleration must be
+      proportional to the amplitude, and peak velocity to both. All pulses have equal weights.
     - `acceleration`: (rows,) peak accelerations [g], positive and rising.
     - `ratio`: (columns,) PGV/PGA [s], positive and rising.
     - `model`, `engine`, `progress`: as in `rocking_spectrum`.
@@ -339,7 +341,7 @@ def simulated_surface(
     for pulse in pulses:
         unit = _unit(pulse)
         peak, speed = float(peak_acceleration(unit)), float(peak_velocity(unit))
-        # One motion of amplitude 1 g for every ratio, scaled to every acceleration.
+        # One motion of amplitude 1 g for each ratio is scaled to every acceleration.
         period = ratio * GRAVITY * peak / speed
         group = jax.vmap(lambda t, pulse=pulse: pulse(jnp.ones_like(t), t))(period)
         factors = both_ways(np.broadcast_to(np.asarray(acceleration) / peak, (ratio.size, acceleration.size)), facing)
@@ -349,7 +351,7 @@ def simulated_surface(
 
 
 def _unit(pulse: Callable) -> AbstractMotion:
-    """What a function makes of amplitude 1 g and period 1 s."""
+    """Return the motion that a pulse makes from amplitude 1 g and period 1 s; raise ValueError if it makes none."""
     try:
         inspect.signature(pulse).bind(1.0, 1.0)
     except (TypeError, ValueError) as error:
@@ -368,7 +370,7 @@ def _verdicts(
     draws = jax.tree.leaves(blocks)[0].shape[0]
     motions, levels = factors.shape
     index, draw = np.arange(motions), np.arange(draws)
-    # Neighbours differ by the level: they move alike.
+    # Neighbouring lanes differ only in the level, so that their responses take similar steps.
     points = (
         np.repeat(index, draws * levels),
         np.tile(np.repeat(draw, levels), motions),
@@ -381,7 +383,7 @@ def _verdicts(
 
 def _verdict(index, draw, factor, scene):
     blocks, group, model, engine = scene
-    motion = jax.tree.map(lambda x: x[index], group)  # `jax.vmap` has made all of it, shared arrays, too, one for each
+    motion = jax.tree.map(lambda x: x[index], group)  # `jax.vmap` gave every leaf, also shared ones, a leading axis
     result = outcome(one_of_many(blocks, draw), felt(motion, factor), model, engine=engine)
     verdict = jnp.where(result.overturned, TOPPLED, STOOD)
     return jnp.where(result.status == Status.successful, verdict, UNDECIDED).astype(jnp.int8)

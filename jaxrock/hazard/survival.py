@@ -1,8 +1,8 @@
-"""How often shakings of a hazard curve topple rocks, and what the survival of precariously balanced rocks says of it.
+"""Rates at which shakings of a hazard curve topple rocks, and tests of the curve by rocks that have survived.
 
-A shaking topples a rock with the probability that its fragility gives. Rocks at one site share their shakings: given
-the intensity they topple independently, but what spares one is likely to spare the others, so that their joint survival
-is more probable than the product of the single ones.
+The fragility of a rock gives the probability that a shaking topples it. Rocks at one site share their shakings. Given
+the intensity they topple independently, but a shaking that spares one is likely to spare the others. Their joint
+survival is therefore more probable than the product of the single ones.
 """
 
 import functools
@@ -33,9 +33,9 @@ def _one_or_many(name: str, value: Any) -> tuple[AbstractFragility, ...]:
 
 Fragilities = Annotated[AbstractFragility | Sequence[AbstractFragility], _one_or_many]
 
-_Stack = tuple[AbstractFragility, int]  # how many are in it, which a fragility without numbers does not tell
+_Stack = tuple[AbstractFragility, int]  # with the number of rocks, because a fragility may have no arrays
 
-# Where `allowed_scale` looks for its factor: 20 steps a decade.
+# Factors at which `allowed_scale` evaluates survival: 20 steps a decade.
 _FACTORS = np.geomspace(1e-4, 1e4, 161)
 
 
@@ -47,7 +47,7 @@ def _check(fragilities: Fragilities, curve: HazardCurve) -> None:
 
 @arguments
 def toppling_rate(fragility: AbstractFragility, curve: HazardCurve) -> Number:
-    """Annual rate of shakings that topple a rock: the fragility integrated over the rates of the hazard curve.
+    """Return the annual rate of shakings that topple a rock: the fragility integrated over the hazard curve's rates.
 
     **Arguments:**
 
@@ -68,16 +68,16 @@ def toppling_rate(fragility: AbstractFragility, curve: HazardCurve) -> Number:
 
 @arguments
 def survival_probability(fragilities: Fragilities, ages: Values, curve: HazardCurve) -> Number:
-    """Probability that all rocks of a site have stood since they became fragile, under the shakings they share.
+    """Return the probability that all rocks of a site have stood since they became fragile, under shared shakings.
 
-    At each time before present only the rocks that were fragile already count: the rate of shakings that topple at
-    least one of them is the integral of 1 - (1 - F1)(1 - F2)... over the curve.
+    At each time before present only rocks that were already fragile count. The rate of shakings that topple at least
+    one of them is the integral of 1 - (1 - F1)(1 - F2)... over the curve.
 
     **Arguments:**
 
-    - `fragilities`: of a rock, or of each.
-    - `ages`: for how long each rock has been fragile [years], (rocks,), or one number for all; 0 or more. Where ages
-      are uncertain: the mean over samples, by `jax.vmap`.
+    - `fragilities`: that of one rock, or a list of one for each rock.
+    - `ages`: time for which each rock has been fragile [years], (rocks,), or one number for all; 0 or more. For
+      uncertain ages, take the mean over samples, by `jax.vmap`.
     - `curve`: a `HazardCurve`; under `jax.vmap` for many.
 
     **Returns:** the probability.
@@ -90,7 +90,7 @@ def survival_probability(fragilities: Fragilities, ages: Values, curve: HazardCu
 
 @arguments
 def branch_weights(prior: Values, survival: Values) -> Inexact[Array, " branches"]:
-    """Weights of the branches of a logic tree after rocks were found standing (Bayes).
+    """Return the weights of the branches of a logic tree after rocks were found standing (Bayes).
 
     **Arguments:**
 
@@ -99,8 +99,8 @@ def branch_weights(prior: Values, survival: Values) -> Inexact[Array, " branches
 
     **Returns:** (branches,) weights that add to 1.
 
-    **Raises:** ValueError for values outside their ranges or of different shapes, and if under every branch that has
-    weight the rocks must have toppled: then none of the branches explains them.
+    **Raises:** ValueError for values outside their ranges or of different shapes, and if the survival is 0 under every
+    branch that has weight: then none of the branches explains the rocks.
     """
     prior = not_negative("prior", prior)
     survival = share("survival", survival)
@@ -116,20 +116,22 @@ def branch_weights(prior: Values, survival: Values) -> Inexact[Array, " branches
 
 @arguments
 def allowed_scale(fragilities: Fragilities, ages: Values, curve: HazardCurve, probability: ArrayLike = 0.05) -> Number:
-    """The factor on the intensity of every shaking at which the survival of all rocks falls to a given probability.
+    """Return the factor on the intensity of all shakings at which the survival of all rocks has a given probability.
 
-    Larger factors are rejected with the confidence 1 - `probability`. The levels of the curve are scaled; its rates
-    stay.
+    Larger factors are rejected with the confidence 1 - `probability`. The factor scales the levels of the curve, and
+    not its rates.
 
     **Arguments:**
 
     - `fragilities`, `ages`, `curve`: as in `survival_probability`.
     - `probability`: of survival, in (0, 1).
 
-    **Returns:** the smallest such factor between 1e-4 and 1e4, with derivatives of every order; 0 if
-    survival is less probable under the smallest one already, infinite if more probable under all. Survival is looked
-    up at 20 factors a decade: where a fragility that rises and falls makes it dip for less than that, the dip may be
-    missed. A large factor brings the weakest shakings into play: compare with that of `curve.extended`.
+    **Returns:** the smallest such factor between 1e-4 and 1e4, with derivatives of every order. It is 0 if survival is
+    less probable already under the smallest factor, and infinite if it is more probable under all.
+
+    Survival is evaluated at 20 factors a decade. A fragility that rises and falls may make survival dip within a
+    shorter range, and the search may miss that dip. With a large factor the weakest shakings matter: compare the result
+    with that of `curve.extended`.
 
     **Raises:** ValueError for arguments outside their ranges, and for another measure's curve.
 
@@ -141,7 +143,7 @@ def allowed_scale(fragilities: Fragilities, ages: Values, curve: HazardCurve, pr
 
 
 def _rocks(fragilities: Fragilities, ages: Values) -> tuple[tuple[_Stack, ...], Inexact[Array, " rocks"]]:
-    """The rocks, all with fragilities of one kind stacked into one, and an age for each in the order of the stacks."""
+    """Stack the fragilities of equal kinds; return the stacks, and the ages of all rocks in their order."""
     rocks = _one_or_many("fragilities", fragilities)
     ages = not_negative("ages", ages)
     if ages.shape not in ((), (len(rocks),)) or not rocks:
@@ -157,7 +159,7 @@ def _rocks(fragilities: Fragilities, ages: Values) -> tuple[tuple[_Stack, ...], 
         shape = jax.eval_shape(rocks[first], jax.ShapeDtypeStruct((), ages.dtype)).shape
         if shape:
             raise ValueError(f"Argument `fragilities` must each be of one rock, but one has shape {shape}.")
-    # A hundred rocks of one kind are compiled as one.
+    # Rocks of one kind are vmapped, so that a hundred of them compile as one.
     stacks = []
     for members in kinds.values():
         numbers, rest = eqx.partition([rocks[index] for index in members], eqx.is_array_like)
@@ -167,7 +169,7 @@ def _rocks(fragilities: Fragilities, ages: Values) -> tuple[tuple[_Stack, ...], 
 
 
 def _stacked(*numbers: Any) -> Array:
-    """By NumPy where they are known: JAX would compile that for every number of rocks."""
+    """Stack numbers; concrete ones by NumPy, because JAX would compile a program for every number of rocks."""
     if any(isinstance(number, jax.core.Tracer) for number in numbers):
         return jnp.stack(numbers)
     return placed(np.stack([np.asarray(number) for number in numbers]))
@@ -175,23 +177,24 @@ def _stacked(*numbers: Any) -> Array:
 
 @quickly(eqx.filter_jit)
 def _toppling_rate(fragility: AbstractFragility, curve: HazardCurve) -> Number:
-    if type(fragility) is LogNormalFragility:  # what is made of it may have other probabilities
+    if type(fragility) is LogNormalFragility:  # a subclass may have other probabilities
         return _lognormal_rate(fragility, curve)
     levels, rates = shakings(curve, fragility.knots)
     return rates @ fragility(levels)
 
 
 def _lognormal_rate(fragility: LogNormalFragility, curve: HazardCurve) -> Number:
-    """The rate by parts: that at the first known level, and the integral of the rate over the fragility.
+    """Return the toppling rate in closed form, integrated by parts.
 
-    Over a power law with exponent k, and with z = ln(level/median)/dispersion, that is
+    It is the rate at the first known level times the fragility there, plus the integral of the rate over the fragility.
+    Over a power law with exponent k, and with z = ln(level/median)/dispersion, that integral is
     rate(start) exp(a^2/2 - z(start)^2/2) [Phi(b) - Phi(a)], where a and b are z + k dispersion at start and end.
     """
     known, exponents = power_laws(curve)
     logarithms = jnp.log(curve.levels / fragility.median)
     z = logarithms / fragility.dispersion
     start, end = z[:-1] + exponents * fragility.dispersion, z[1:] + exponents * fragility.dispersion
-    # Both in the lower tail, where their difference keeps its digits.
+    # Evaluate both in the lower tail, where their difference keeps its digits.
     upper = start + end > 0
     low, high = jnp.where(upper, -end, start), jnp.where(upper, -start, end)
     logarithm = log_ndtr(high) + jnp.log(-jnp.expm1(log_ndtr(low) - log_ndtr(high)))
@@ -205,25 +208,25 @@ def _lognormal_rate(fragility: LogNormalFragility, curve: HazardCurve) -> Number
 
 @quickly(eqx.filter_jit)
 def _topplings(rocks: tuple[_Stack, ...], ages: Inexact[Array, " rocks"], curve: HazardCurve) -> Number:
-    """Expected number of shakings that topple at least one of the rocks that are fragile by then."""
+    """Return the expected number of shakings that topple at least one of the rocks that are fragile at that time."""
 
     def of_each(function):
         return [eqx.filter_vmap(function, axis_size=count)(rock) for rock, count in rocks]
 
     knots = [each.ravel() for each in of_each(lambda rock: rock.knots)]
     levels, rates = shakings(curve, jnp.concatenate(knots))
-    # With the oldest rock first, the first k rocks count from the age of rock k to that of the next.
+    # With the oldest rock first, the first k rocks are fragile from the age of rock k to that of the next.
     order = jnp.argsort(-ages)
     ages = ages[order]
     single = jnp.concatenate(of_each(lambda rock: rock(levels)))[order]
-    # 1 - (1 - F)(1 - G), in which small probabilities do not cancel.
+    # This form of 1 - (1 - F)(1 - G) does not lose digits of small probabilities.
     joint = jax.lax.associative_scan(lambda f, g: f + g * (1 - f), single)
     return (ages - jnp.append(ages[1:], 0.0)) @ (joint @ rates)
 
 
 @quickly(eqx.filter_jit)
 def _allowed_scale(rocks, ages, curve, most: Number) -> Number:
-    """As `allowed_scale`, at which `most` topplings are expected."""
+    """Return the factor of `allowed_scale`, at which `most` topplings are expected."""
     numbers, rest = eqx.partition((rocks, ages, curve, most), eqx.is_array)
 
     def excess(logarithm, numbers):
@@ -235,7 +238,7 @@ def _allowed_scale(rocks, ages, curve, most: Number) -> Number:
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _first_factor(excess: Callable, numbers: PyTree) -> Number:
-    """The first factor at which `excess(ln factor, numbers)` is not negative."""
+    """Return the first factor at which `excess(ln factor, numbers)` is not negative."""
     grid = jnp.log(jnp.asarray(_FACTORS, jnp.result_type(float)))
     reached = jax.lax.map(lambda logarithm: excess(logarithm, numbers), grid) >= 0
     at = jnp.argmax(reached)

@@ -224,7 +224,7 @@ def _by_proposals(problem: Problem, estimate: Estimate, wanted: _Wanted, bar: Pr
     chains, sizes = sampler.init(_summits(problem, estimate), random), np.zeros(0)
     for done in range(0, wanted.steps, _ROUND // _CHAINS):
         if chains.steps >= _PATIENCE and sizes.min() < _POOR * _CHAINS * chains.steps:
-            chains = sampler.anew(random, chains)  # poor mixing: adapt the proposals to the chains, and start again
+            chains = sampler.anew(random, chains)  # poor mixing: adapt the proposals to all points so far, and restart
         chains, _ = sampler.step(random, chains, min(_ROUND // _CHAINS, wanted.steps - done))
         sizes, r_hat = diagnostics(chains.places[1:])
         bar.add(1)

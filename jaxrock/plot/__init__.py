@@ -1,6 +1,7 @@
 """Figures: functions that take results, draw them into matplotlib axes and return the axes.
 
-Imports everything but `command_line`. One module for each kind of result; another figure is a function in one of them.
+The package imports all others except `command_line`. Each kind of result has a module; a new figure is a function in
+one of them.
 """
 
 from jaxrock._surface import shown as _shown

@@ -29,8 +29,8 @@ from jaxrock.responses.own_block import check_own
 if TYPE_CHECKING:
     from matplotlib.animation import FuncAnimation
 
-_LONGEST = 20.0  # seconds of a film whose speed is not given
-_FLASH = 0.12  # seconds of the film that an impact is seen
+_LONGEST = 20.0  # [s] longest duration of a film whose speed is not given
+_FLASH = 0.12  # [s] time for which an impact is marked in the film
 
 
 @arguments
@@ -47,10 +47,10 @@ def animate(
     **Arguments:**
 
     - `response`: result of `simulate`, of one scene.
-    - `block`: what is drawn; None: the rectangle of the response's slenderness and frequency parameter, or its flexible
-      block. An asymmetric block must be given.
-    - `model`: a `Spring`, whose column is drawn then. Edges on which a block rolls are known.
-    - `speed`: seconds of the response per second of the film, positive; None: 1, or what makes it last 20 s.
+    - `block`: the block to draw. None: the rectangle of the response's slenderness and frequency parameter, or its
+      flexible block. An asymmetric block must be given.
+    - `model`: a `Spring`, to draw its column. Edges on which a block rolls come from the response.
+    - `speed`: seconds of the response per second of the film, positive; None: 1, or more to make the film last 20 s.
     - `fps`: pictures per second, in [1, 240].
 
     **Returns:** a `matplotlib.animation.FuncAnimation`. `save_animation` writes it; in a notebook
@@ -74,7 +74,7 @@ def animate(
         lean = np.sin(turned) if response.scene.block.rotations == "finite" else turned
         bending = np.asarray(response.column(time)) - np.cos(alpha) * lean[:, None] * heights
     parts = _Parts(response, body, rate, rotation)
-    last = fps  # pictures of the verdict: for a second
+    last = fps  # number of pictures that show the verdict, for one second
 
     def show(number: int) -> list:
         k = min(number, count - 1)
@@ -97,7 +97,7 @@ def _drawn(response: Response | FlexibleResponse, block: AnyBlock | None) -> Any
 
 
 def _edges(response: Response | FlexibleResponse) -> tuple[Edge, Edge] | None:
-    """Those on which a block has rolled."""
+    """Return the edges on which a block rolls, to the right and to the left; None for other blocks."""
     if isinstance(response, FlexibleResponse) or not isinstance(response.scene.moments, RollingMoments):
         return None
     moments: Any = response.scene.both_moments
@@ -106,7 +106,7 @@ def _edges(response: Response | FlexibleResponse) -> tuple[Edge, Edge] | None:
 
 
 def _room(body: Body, rotation: np.ndarray) -> tuple[float, float, float]:
-    """How far a body comes to the left, to the right and upward [m]; of a block that stands, as far to either side."""
+    """Return the left, right and upper limits of the drawing [m], which hold the body at all its rotations."""
     known = rotation[np.isfinite(rotation)]
     turns = np.quantile(known, np.linspace(0, 1, 100)) if known.size else np.zeros(1)
     places = np.concatenate([body.pose(float(turn)).outline for turn in turns])
@@ -115,7 +115,7 @@ def _room(body: Body, rotation: np.ndarray) -> tuple[float, float, float]:
 
 
 class _Parts:
-    """The figure of a film, and what moves in it."""
+    """The figure of a film, and its moving artists."""
 
     def __init__(self, response: Response | FlexibleResponse, body: Body, rate: float, rotation: np.ndarray):
         import matplotlib.pyplot as plt
@@ -132,7 +132,7 @@ class _Parts:
         self.outline, self.column, self.masses = draw(scene, body, body.pose(0.0))
         (self.flash,) = scene.plot([], [], "*", color=RED, markersize=16, zorder=5)
         self.verdict = textwrap.fill(why_not(response.status) or ("overturns" if response.overturned else "stands"), 42)
-        self.words = scene.set_title("\n" * self.verdict.count("\n") + "\n.", fontsize=10)  # room for what will be said
+        self.words = scene.set_title("\n" * self.verdict.count("\n") + "\n.", fontsize=10)  # room for the verdict
         peak = float(np.max(np.asarray(self._motion.bounds)))
         self.reach = 0.8 * size / max(peak, 1e-12)
         self.arrow = scene.quiver(
@@ -141,7 +141,7 @@ class _Parts:
         self.impacts = np.asarray(response.impact_times)
         self.cursors = self._histories(axes["rotation"], axes["ground"])
         self.figure.canvas.draw()
-        self.figure.set_layout_engine("none")  # where things are is found once, not for every picture
+        self.figure.set_layout_engine("none")  # keep the layout of the first picture for all
 
     @property
     def _motion(self):
@@ -186,32 +186,33 @@ class _Parts:
 def save_animation(
     film: "FuncAnimation", path: Annotated[str | Path, path_of], *, dpi: Annotated[int, at_least(10, 1000)] = 80
 ) -> None:
-    """Write a film as its file's name says: GIF, HTML that plays by itself, or MP4.
+    """Write a film in the format of the file's ending: GIF, self-contained HTML, or MP4.
 
-    Its duration follows from the pictures per second. Pictures of a GIF last whole hundredths of a second, and at least
-    two, as viewers slow others down. Above 50 per second some are left out. Pictures of HTML last whole thousandths.
+    The duration follows from the pictures per second. Pictures of a GIF last whole hundredths of a second, and at least
+    two, because viewers slow down shorter ones. Above 50 pictures per second, a GIF leaves some out. Pictures of HTML
+    last whole thousandths.
 
     **Arguments:**
 
-    - `film`: result of `animate`. `path`: ends with .gif, .html or .mp4; a file that is there is replaced, and not
-      before the film is whole.
+    - `film`: result of `animate`. `path`: ends with .gif, .html or .mp4; an existing file is replaced only when the
+      film is complete.
     - `dpi`: dots per inch.
 
-    **Raises:** ValueError for another ending; for MP4 where the program ffmpeg is not there: that of the system, or of
+    **Raises:** ValueError for another ending, and for MP4 without the program ffmpeg: that of the system, or of
     `pip install "jaxrock[film]"`. OSError if the file cannot be written.
     """
     import matplotlib
     from matplotlib.animation import FFMpegWriter
 
     own: Any = film
-    interval, path = own._interval, Path(path)  # that of `event_source` is cut to whole milliseconds
+    interval, path = own._interval, Path(path)  # `event_source.interval` is truncated to whole milliseconds
     kind = path.suffix.lower()
     if kind == ".gif":
         with written_aside(path, replace=True, lasting=False) as aside:
             film.save(aside, writer=_gif_writer(interval), dpi=dpi)
     elif kind == ".html":
-        vars(own).pop("_html_representation", None)  # which matplotlib keeps, whatever dpi it is of
-        # In megabytes: beyond it pictures would be left out. 1000 // fps is what a picture lasts.
+        vars(own).pop("_html_representation", None)  # matplotlib's cached HTML may have another dpi
+        # A large `embed_limit` [MB] keeps matplotlib from leaving out pictures. A picture lasts 1000 // fps [ms].
         with matplotlib.rc_context({"savefig.dpi": dpi, "animation.embed_limit": 1e6}):
             with_size = film.to_jshtml(fps=1000 / (round(interval) + 0.5), embed_frames=True)
         title = html.escape(path.stem)
@@ -233,7 +234,7 @@ def save_animation(
 
 
 def _gif_writer(interval: float):
-    """A writer of pictures that are due every so many milliseconds: each lasts until the next one is due, to 10 ms."""
+    """Return a GIF writer for pictures at an interval [ms]; each lasts until the next, rounded to 10 ms."""
     from matplotlib.animation import PillowWriter
 
     every = int(np.ceil(20 / interval - 1e-9))
@@ -250,7 +251,7 @@ def _gif_writer(interval: float):
 
 
 def _ffmpeg() -> str:
-    """The program that matplotlib is told to take, or one that a package brought, where that is not there."""
+    """Return matplotlib's configured ffmpeg, or that of the package `imageio_ffmpeg` if the first is not installed."""
     import matplotlib
 
     usual = matplotlib.rcParams["animation.ffmpeg_path"]

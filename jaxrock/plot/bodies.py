@@ -1,4 +1,4 @@
-"""Blocks as they are drawn: outline, column and masses in metres, at any rotation."""
+"""Drawn shapes of blocks: outline, column and masses in metres, at any rotation."""
 
 from typing import NamedTuple
 
@@ -17,7 +17,7 @@ AnyBlock = Block | AsymmetricBlock | FlexibleBlock
 
 
 class Shapes(NamedTuple):
-    """What is drawn of a body at one moment; (n, 2) places [m]."""
+    """The drawn shapes of a body at one moment; (n, 2) places [m]."""
 
     outline: np.ndarray
     column: np.ndarray
@@ -26,9 +26,9 @@ class Shapes(NamedTuple):
 
 
 class Body(NamedTuple):
-    """A block at rest: the corners on the ground, midway between them the origin; and the column that models it.
+    """A block at rest, with the origin midway between its corners on the ground, and the column that models it.
 
-    A rigid block has the column's heights and masses empty; one that rolls has edges, to the right and to the left.
+    A rigid block has no heights and masses of a column; a rolling one has edges, to the right and to the left.
     """
 
     outline: np.ndarray  # (n, 2) [m]
@@ -41,8 +41,11 @@ class Body(NamedTuple):
 
     @classmethod
     def of(cls, block: AnyBlock, model: AbstractEquation, edges: tuple[Edge, Edge] | None = None) -> "Body":
-        """Of a block of scalars. What its parameters do not tell is drawn as simply as may be: the rectangle of its p,
-        or the parallelogram about its centre of mass; with `edges`, or those of the model, on which it rolls."""
+        """Return the body of a block of scalars, with `edges`, or those of the model, on which it rolls.
+
+        Its parameters do not determine its whole shape. The body is the rectangle of its p, or the parallelogram about
+        its centre of mass.
+        """
         check_single(block=block, model=model)
         if isinstance(model, Rolling):
             edges = model.edge, model.other or model.edge
@@ -72,7 +75,7 @@ class Body(NamedTuple):
         return cls(outline, right, left, centre, np.zeros(0), np.zeros(0))
 
     def _rounded(self, edges: tuple[Edge, Edge]) -> "Body":
-        """The body with its edges, to where they are upright or as high as it is; its sides begin there."""
+        """Return the body with its edges, up to where they are upright or reach its top; its sides begin there."""
         top, parts = self.outline[:, 1].max(), []
         for way, corner, edge in zip((1, -1), (self.right, self.left), edges):
             out, up = map(np.asarray, edge.place(np.linspace(0, np.pi / 2, 60)))
@@ -84,7 +87,7 @@ class Body(NamedTuple):
         return self._replace(outline=np.concatenate([right, over_right, over_left, left[::-1]]), edges=edges)
 
     def placed(self, points: np.ndarray, rotation: float) -> np.ndarray:
-        """Places [m] of the block at rest, where they are at a rotation [rad]."""
+        """Return where points [m] of the block at rest are at a rotation [rad]."""
         side, corner = (1, self.right) if rotation >= 0 else (-1, self.left)
         if self.edges is None:
             return turned(points, corner, rotation)
@@ -94,7 +97,7 @@ class Body(NamedTuple):
         return turned(points, touching, rotation) + self.contact(rotation) - touching
 
     def contact(self, rotation: float) -> np.ndarray:
-        """Where it touches the ground at a rotation [rad]: a corner, or where its edge has rolled to."""
+        """Return the point of contact with the ground at a rotation [rad]: a corner, or a point of a rolling edge."""
         side, corner = (1, self.right) if rotation >= 0 else (-1, self.left)
         if self.edges is None:
             return corner
@@ -102,8 +105,10 @@ class Body(NamedTuple):
         return corner + np.array([side * rolled, 0.0])
 
     def lying(self, rotation: np.ndarray) -> np.ndarray:
-        """Rotations [rad] as they are drawn: a block that has fallen, by a quarter of a turn, lies on its side, also
-        where that leans. One that rolls is left as it is."""
+        """Return the rotations [rad] to draw, limited to those at which a fallen block lies on its side.
+
+        Block sides may lean, so that this is not always pi/2. Rotations of a rolling block are unchanged.
+        """
         if self.edges is not None:
             return rotation
         for side, corner in ((1, self.right), (-1, self.left)):
@@ -119,8 +124,10 @@ class Body(NamedTuple):
         return float(max(np.hypot(*self.outline.T).max(), self.heights.max(initial=0.0)))
 
     def pose(self, rotation: float, bending: np.ndarray | None = None) -> Shapes:
-        """Turned by a rotation [rad] about the corner on which it stands, or rolled, and bent: (nodes,) [m], across the
-        column."""
+        """Return the shapes at a rotation [rad] about a corner, or rolled, and with bending.
+
+        `bending`, (nodes,) [m], is the displacement across the column.
+        """
         outline, column = self.outline, np.stack([0 * self.heights, self.heights], 1)
         if bending is not None and self.heights.size:
             share = self.outline[:, 1] / self.outline[:, 1].max() * self.heights[-1]
@@ -132,7 +139,7 @@ class Body(NamedTuple):
 
 
 def _column(block: Block | FlexibleBlock, model: AbstractEquation, radius: float, h: float) -> tuple:
-    """Heights of the nodes and of the masses of the column that models a block."""
+    """Return heights of the nodes and of the masses of the column that models a block."""
     if isinstance(block, FlexibleBlock):
         nodes = np.linspace(0, 2 * radius, block.masses)
         return nodes, nodes
@@ -146,6 +153,6 @@ def _column(block: Block | FlexibleBlock, model: AbstractEquation, radius: float
 
 
 def turned(points: np.ndarray, pivot: np.ndarray, rotation: float) -> np.ndarray:
-    """Places [m] turned about a pivot; a positive rotation is clockwise: the block leans to the right."""
+    """Return points [m] turned about a pivot; a positive rotation is clockwise: the block leans to the right."""
     sine, cosine = np.sin(rotation), np.cos(rotation)
     return pivot + (points - pivot) @ np.array([[cosine, -sine], [sine, cosine]])

@@ -17,13 +17,14 @@ if TYPE_CHECKING:
 def safety_regions(
     shape: float, axis: "Axes | None" = None, *, longest: float = 8.0, points: int = 400, legend: bool = True
 ) -> "Axes":
-    """Draw what becomes of a slender block under a single-lobe pulse of one shape, from closed forms.
+    """Draw the outcomes of a slender block under a single-lobe pulse of one shape, from closed forms.
 
     **Arguments:**
 
     - `shape`: of the pulse, from -inf (rectangle) to +inf (spike).
     - `axis`: matplotlib axis; None makes a figure.
-    - `longest`: largest pulse duration p t_d. `points`: along each curve. `legend`: below the axis, what letters mean.
+    - `longest`: largest pulse duration p t_d. `points`: along each curve. `legend`: whether to explain the letters
+      below the axis.
 
     **Returns:** the axis.
 
@@ -72,12 +73,13 @@ def sine_regions(
     - `restitution`: in [0, 1].
     - `axis`: matplotlib axis, such as `overturning` returns; None makes a figure.
     - `frequency_ratio`: (n,) omega/p; None: 0.3 to 8.
-    - `by_duration`: uplift strength over pulse duration, in place of intensity over frequency ratio: as the map is.
+    - `by_duration`: whether to draw uplift strength over pulse duration, in place of intensity over frequency ratio;
+      it must agree with the map.
 
     **Returns:** the axis.
 
     **Raises:** ValueError for an axis over pulse durations without `by_duration`, for one over frequency ratios with
-    it, and for one on which `borders` are drawn by their strength, or by a `scale`.
+    it, and for one on which `borders` are drawn by strength, or by a `scale`.
 
     **Source:** Dimitrakopoulos & DeJong (2012), figure 4: equations 3.10, 3.18, 3.20 with 3.21, and 3.31.
     """
@@ -108,17 +110,17 @@ def sine_regions(
         x, y = (2 * np.pi / x, 1 / y) if by_duration else (x, y)
         axis.plot(x, y, color=color, linestyle=style, linewidth=1.2, label=name)
     words = (DURATION, f"{STRENGTH} $g\\alpha/a_g$") if by_duration else (RATIO, f"{INTENSITY} $a_g/g\\alpha$")
-    axis.set_xlabel(axis.get_xlabel() or words[0])  # a map below has its own words
+    axis.set_xlabel(axis.get_xlabel() or words[0])  # keep the labels of a map on the axis
     axis.set_ylabel(axis.get_ylabel() or words[1])
     before = axis.get_legend()
     axis.legend(loc="upper left" if before is None or by_duration else "lower right", fontsize=7)
     if before is not None:
-        axis.add_artist(before)  # of the map below
+        axis.add_artist(before)  # keep the legend of a map on the axis
     return axis
 
 
 def _check_coordinates(axis: "Axes", by_duration: bool) -> None:
-    """Raise ValueError for an axis whose labels say that it is over something else, or a multiple of it."""
+    """Raise ValueError for an axis whose labels name other quantities, or multiples of the expected ones."""
     across, upward = axis.get_xlabel(), axis.get_ylabel()
     if across == (RATIO if by_duration else DURATION):
         raise ValueError(f"Argument `by_duration` must be {not by_duration} for an axis over {across!r}.")
@@ -127,14 +129,14 @@ def _check_coordinates(axis: "Axes", by_duration: bool) -> None:
         raise ValueError(f"Argument `axis` must have the {mine} upward, but has {upward!r}.")
 
 
-_PIECE = 8  # points
+_PIECE = 8  # points of a curve in one call
 
 
 def _to_its_tips(curve: Callable, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """A curve, also between the last place at which it is known and the one beyond where it ends."""
+    """Return a curve with further points up to its ends, which bisection finds between finite and other values."""
 
     def at(places: np.ndarray) -> np.ndarray:
-        # In pieces of one size: one program. A curve has a few ends, and all of it has been asked once.
+        # Pieces of one size need a single compiled program; there are few points, because a curve has few ends.
         whole = np.resize(places, (-(-places.size // _PIECE), _PIECE))
         return np.concatenate([np.asarray(curve(piece)) for piece in whole])[: places.size]
 
@@ -148,7 +150,7 @@ def _to_its_tips(curve: Callable, x: np.ndarray) -> tuple[np.ndarray, np.ndarray
         there = np.isfinite(at(middle))
         inner, outer = np.where(there, middle, inner), np.where(there, outer, middle)
     if ends.size:
-        share = 1 - np.linspace(1, 0, 20)[1:, None] ** 3  # they turn over there
+        share = 1 - np.linspace(1, 0, 20)[1:, None] ** 3  # curves turn at their ends: points are denser there
         more = (start + share * (inner - start)).ravel()
         x, y = np.concatenate([x, more]), np.concatenate([y, at(more)])
     order = np.argsort(x)

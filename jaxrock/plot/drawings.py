@@ -1,4 +1,4 @@
-"""Drawings of scenes, to scale: a block or the column that models it, the ground, the motion, and their symbols."""
+"""Draw scenes to scale: a block or the column that models it, the ground, the motion, and their symbols."""
 
 from typing import TYPE_CHECKING, Any
 
@@ -41,23 +41,23 @@ def scene(
 ) -> "Axes":
     """Draw a block, or the spring or column that models it, to scale and with its symbols, and the motion below it.
 
-    Corner O is that of positive rotations; the ground's acceleration counts to the right. Of a block that is known by
-    slenderness and frequency alone, the rectangle of that p is drawn; of an asymmetric one the parallelogram with its
-    corners and its centre of mass.
+    Corner O is that of positive rotations; the ground's acceleration is positive to the right. A block defined by
+    slenderness and frequency alone is drawn as the rectangle of that p. An asymmetric one is drawn as the parallelogram
+    with its corners and its centre of mass.
 
     **Arguments:**
 
     - `block`: a `Block`, `AsymmetricBlock` or `FlexibleBlock` of scalars; `motion`: any motion; None leaves it out.
     - `axis`: matplotlib axis; None makes a figure.
-    - `model`: as in `outcome`: of a `Spring`, its column is drawn, and the block behind it; of a `Rolling`, the block's
+    - `model`: as in `outcome`. A `Spring` adds its column, with the block behind it; a `Rolling` adds the block's
       edges.
-    - `rotation`: at which the block is drawn [rad], in [-pi/2, pi/2].
+    - `rotation`: rotation of the drawn block [rad], in [-pi/2, pi/2].
     - `bending`: displacement of the top of a flexible block by bending, in its first clamped mode [m].
 
     **Returns:** the axis.
 
-    **Raises:** ValueError for arguments outside their ranges, arrays where scalars are wanted, and `bending` of a block
-    that does not bend.
+    **Raises:** ValueError for arguments outside their ranges, arrays in place of scalars, and `bending` of a block that
+    does not bend.
 
     **Source:** Voyagaki et al. (2012), figure 2.1; Dimitrakopoulos & DeJong (2012), figure 1; Diamantopoulos &
     Fragiadakis (2017), figures 1, 2, 4, 6, 8 and 10.
@@ -91,7 +91,7 @@ def scene(
 
 
 def _axis_over(motion: AbstractMotion | None) -> "Axes":
-    """A new axis, with room for a motion below it: a share of the axis, which constrained layouts cut off."""
+    """Return a new axis, with room for a motion below it; a constrained layout would cut that inset off."""
     import matplotlib.pyplot as plt
 
     if motion is None:
@@ -103,7 +103,7 @@ def _axis_over(motion: AbstractMotion | None) -> "Axes":
 
 
 def draw_ground(axis: "Axes", body: Body) -> None:
-    """The ground with its hatching."""
+    """Draw the ground with its hatching."""
     from matplotlib.patches import Polygon
 
     size, (right, left) = body.size, (body.right, body.left)
@@ -115,7 +115,7 @@ def draw_ground(axis: "Axes", body: Body) -> None:
 
 
 def draw(axis: "Axes", body: Body, shapes: Shapes) -> "tuple[Polygon, Line2D, Line2D]":
-    """The block and its column, as artists that can be moved: outline, column, masses, spring."""
+    """Draw the block with its column and spring; return outline, column and masses as artists that can be moved."""
     from matplotlib.patches import Polygon
 
     modelled = bool(body.heights.size)
@@ -136,13 +136,13 @@ def draw(axis: "Axes", body: Body, shapes: Shapes) -> "tuple[Polygon, Line2D, Li
 def _between(
     axis: "Axes", start: np.ndarray, end: np.ndarray, label: str, offset: Any = (0.0, 0.0), ha: str = "center"
 ) -> None:
-    """A measure: an arrow with two heads and its symbol."""
+    """Draw a dimension: an arrow with two heads and its symbol."""
     axis.annotate("", start, end, arrowprops={"arrowstyle": "<->", "linewidth": 0.8, "shrinkA": 0, "shrinkB": 0})
     axis.text(*((np.add(start, end)) / 2 + offset), label, ha=ha, va="center", fontsize=11)
 
 
 def _arc(axis: "Axes", centre: np.ndarray, radius: float, first: float, last: float, label: str) -> None:
-    """An angle between two directions [rad, counterclockwise from the right], and its symbol."""
+    """Draw an angle between two directions [rad, counterclockwise from the right], and its symbol."""
     angle = np.linspace(first, last, 40)
     axis.plot(centre[0] + radius * np.cos(angle), centre[1] + radius * np.sin(angle), color=RED, linewidth=1.0)
     middle = (first + last) / 2
@@ -157,7 +157,7 @@ def _acceleration(axis: "Axes", body: Body) -> None:
 
 
 def _symbols(axis: "Axes", body: Body, rotation: float, modelled: bool) -> None:
-    """Of a block with two equal sides."""
+    """Draw the symbols of a block with two equal sides."""
     side, size = (1 if rotation >= 0 else -1), body.size
     corner, top = (body.right if side > 0 else body.left), body.outline[:, 1].max()
 
@@ -194,7 +194,7 @@ def _symbols(axis: "Axes", body: Body, rotation: float, modelled: bool) -> None:
 
 
 def _column_symbols(axis: "Axes", body: Body, rotation: float, side: int) -> None:
-    """Length of the column, on the side to which it leans, and its rotation, on the other."""
+    """Draw the length of the column, on the side to which it leans, and its rotation, on the other."""
     length, gap = body.heights[-1], 0.08 * body.size
     full = r"$R\cos\alpha$" if length < body.centre[1] * (1 + 1e-9) else "$R$"
     name = "$2R$" if length > 1.5 * np.hypot(*body.centre) else full
@@ -208,7 +208,7 @@ def _column_symbols(axis: "Axes", body: Body, rotation: float, side: int) -> Non
 
 
 def _sides(axis: "Axes", body: Body, rotation: float) -> None:
-    """Of a block whose sides differ."""
+    """Draw the symbols of a block whose sides differ."""
     gap = 0.08 * body.size
     _acceleration(axis, body)
     centre = body.placed(body.centre, rotation)
@@ -233,7 +233,7 @@ def _sides(axis: "Axes", body: Body, rotation: float) -> None:
 
 
 def _motion(axis: "Axes", motion: AbstractMotion) -> None:
-    """Ground acceleration against time, with the symbols of a pulse."""
+    """Draw ground acceleration against time, with the symbols of a pulse."""
     end = float(motion.end)
     time = moments_seen(motion, -0.05 * end, 1.1 * end, 1501)
     values = np.where(time < 0, 0.0, acceleration_of(motion, np.maximum(time, 0.0)))
@@ -245,7 +245,7 @@ def _motion(axis: "Axes", motion: AbstractMotion) -> None:
     axis.axhline(peak, color=SAND, linewidth=0.8, linestyle="--")
     names = list(declared(type(motion))) if isinstance(motion, AbstractPulse) else []
     amplitude = abs(float(getattr(motion, names[0]))) if names else np.inf
-    is_peak = abs(abs(peak) - amplitude) < 0.01 * amplitude < np.inf  # as far as samples tell
+    is_peak = abs(abs(peak) - amplitude) < 0.01 * amplitude < np.inf  # samples may miss the peak slightly
     axis.text(time[-1], peak, r" $a_g$" if is_peak else " peak", va="center", fontsize=10)
     symbol = {"duration": "$t_d$", "period": "$T_p$"}.get(names[1]) if len(names) > 1 else None
     if symbol:

@@ -1,4 +1,4 @@
-"""Figures of fits to measured histories, and of records that were looked for."""
+"""Figures of fits to measured histories, and of records found by `find_record`."""
 
 import textwrap
 from collections.abc import Sequence
@@ -18,16 +18,16 @@ if TYPE_CHECKING:
 
 @figure(2)
 def history_fit(fit: HistoryFit, time: ArrayLike, axes: "Sequence[Axes] | None" = None) -> "Sequence[Axes]":
-    """Draw a measured and a fitted history, and what is left between them.
+    """Draw a measured and a fitted history, and their residuals.
 
     **Arguments:**
 
-    - `fit`: result of `fit_history`; `time`: (n,) of the measurements, increasing [s].
+    - `fit`: result of `fit_history`; `time`: (n,) times of the measurements, increasing [s].
     - `axes`: two matplotlib axes; None makes a figure.
 
     **Returns:** the axes.
 
-    **Raises:** ValueError for other times than of the measurements: another number of them, or not increasing.
+    **Raises:** ValueError for times whose number is not that of the measurements, or that do not increase.
     """
     import matplotlib.pyplot as plt
 
@@ -51,7 +51,7 @@ def history_fit(fit: HistoryFit, time: ArrayLike, axes: "Sequence[Axes] | None" 
 
 @figure(3)
 def found_record(found: FoundRecord, axes: "Sequence[Axes] | None" = None) -> "Sequence[Axes]":
-    """Draw a record that was found, the one that was changed, and the change, in time and by frequency.
+    """Draw a found record, the record that was changed, and the change, over time and frequency.
 
     **Arguments:**
 
@@ -74,7 +74,7 @@ def found_record(found: FoundRecord, axes: "Sequence[Axes] | None" = None) -> "S
         axes[2].loglog(frequency, dt * np.abs(np.fft.rfft(samples))[1:], color=color, linewidth=0.5)
     axes[0].set_title(textwrap.fill(found.start.name or "", 95), fontsize=8)
     large = time[np.abs(change) > 0.02 * np.abs(change).max()]
-    if large.size:  # elsewhere there is nothing to see
+    if large.size:  # show only the time of the change
         around = 0.5 * (large[-1] - large[0]) + 10 * dt
         axes[0].set_xlim(max(large[0] - around, 0.0), min(large[-1] + around, time[-1]))
         axes[1].set_xlim(axes[0].get_xlim())

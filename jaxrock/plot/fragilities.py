@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 def fragility(
     simulated: SimulatedFragility, fit: LogNormalFragility | None = None, axis: "Axes | None" = None
 ) -> "Axes":
-    """Draw the share of blocks that topple against the level of shaking, and between which bounds it is known.
+    """Draw the share of blocks that topple against the level of shaking, with its bounds.
 
     **Arguments:**
 
@@ -60,8 +60,8 @@ def fragility_surface(
 
     **Arguments:**
 
-    - `simulated`: result of `simulated_surface`. What is undecided is drawn at the middle of its bounds.
-    - `fit`: a `SurfaceFragility` whose contours are drawn over it, dashed.
+    - `simulated`: result of `simulated_surface`. Drawn shares are the means of their bounds.
+    - `fit`: a `SurfaceFragility` whose contours are drawn over the shares, dashed.
     - `axis`: matplotlib axis; None makes a figure. `contours`: probabilities.
 
     **Returns:** the axis.

@@ -21,9 +21,10 @@ def feasible_region(
 
     **Arguments:**
 
-    - `region`: a `FeasibleRegion`, its first parameter upward; both axes logarithmic if all values are positive.
-    - `estimate`: its cross; `wall`: the amplitudes that are not exceeded, over an amplitude and a duration or period,
-      with gaps where not all could be decided; None leaves them out.
+    - `region`: a `FeasibleRegion`, with its first parameter upward. An axis is logarithmic if its values are positive.
+    - `estimate`: an `Estimate`, drawn as a cross; None leaves it out.
+    - `wall`: an `Unexceeded`, for a region over an amplitude and a duration or period. Its curve has gaps where not
+      all amplitudes were decided; None leaves it out.
     - `axis`: matplotlib axis; None makes a figure.
 
     **Returns:** the axis.
@@ -39,7 +40,7 @@ def feasible_region(
     below = np.asarray(region.log_likelihood - region.log_likelihood.max())[np.ix_(up, across)]
     shade = draw_cells(axis, columns, rows, np.maximum(below, -20), cmap="Blues")
     axis.figure.colorbar(shade, ax=axis, label="log-likelihood, less that of the best", extend="min")
-    if min(below.shape) > 1 and below.min() < np.log(0.05):  # else there is no border
+    if min(below.shape) > 1 and below.min() < np.log(0.05):  # otherwise the region has no border in the map
         axis.contour(columns, rows, below, levels=[np.log(0.05)], colors="black", linewidths=1, linestyles="solid")
         axis.plot([], [], color="black", linewidth=1, label="95 % region")
     if curve is not None:
@@ -64,7 +65,7 @@ def _label(name: str) -> str:
 
 
 def _along(wall: Unexceeded, names: tuple[str, str]) -> tuple[np.ndarray, np.ndarray]:
-    """A wall over the second of two parameters and the first; what could not all be decided is no number."""
+    """Return the curve of a wall over the second parameter and the first; NaN where not all was decided."""
     known = np.where(np.asarray(wall.complete), np.asarray(wall.amplitude), np.nan)
     curve = {"amplitude": known} | dict.fromkeys(("duration", "period"), np.asarray(wall.durations))
     if "amplitude" not in names or not set(names) <= set(curve):
@@ -77,12 +78,12 @@ def _along(wall: Unexceeded, names: tuple[str, str]) -> tuple[np.ndarray, np.nda
 
 @figure(1)
 def search(estimate: Estimate, region: FeasibleRegion | None = None, axis: "Axes | None" = None) -> "Axes":
-    """Draw where the search of an estimate has been: a line from each start to a dot where it ended.
+    """Draw the paths of the search of an estimate: a line from each start to a dot at its end.
 
     **Arguments:**
 
     - `estimate`: result of `estimate_motion`.
-    - `region`: a `FeasibleRegion` behind it, whose parameters are drawn; None: the first two of the estimate.
+    - `region`: a `FeasibleRegion` to draw behind the paths, over its parameters; None: the first two of the estimate.
     - `axis`: matplotlib axis; None makes a figure.
 
     **Returns:** the axis.

@@ -20,12 +20,12 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 
-_POINTS = 20_001  # of a curve
-_LONG = 200.0  # [s], with points a hundredth of a second apart
+_POINTS = 20_001  # points of a curve
+_LONG = 200.0  # [s] longest response with equal steps alone, which are then at most 0.01 s
 
 
 def acceleration_of(motion: AbstractMotion, time: np.ndarray) -> np.ndarray:
-    """Ground acceleration at times [g]."""
+    """Return the ground acceleration at times [g]."""
     return np.asarray(motion.acceleration(time))
 
 
@@ -35,7 +35,7 @@ def moments_seen(motion: AbstractMotion, begin: float, end: float, count: int) -
     Each knot comes with the moment before it, which draws jumps.
     """
     knots = np.asarray(motion.knots)
-    # Those that lie outside stay, at the ends: one number of times, one program, for all lengths of padded records.
+    # Clip knots outside instead of dropping them: a fixed number of times needs one program for padded records.
     within = np.clip(np.concatenate([knots, np.nextafter(knots, -np.inf), _curved(motion, knots, count)]), begin, end)
     return np.sort(np.concatenate([np.linspace(begin, end, count), within]))
 
@@ -80,12 +80,12 @@ def _vertical(motion: AbstractMotion, time: jax.Array) -> jax.Array:
 
 
 def vertical_of(motion: AbstractMotion, time: np.ndarray) -> np.ndarray | None:
-    """Vertical acceleration at times (n,) [g], positive upward; None: the ground has none."""
+    """Return the vertical acceleration at times (n,) [g], positive upward; None if the motion has none."""
     return np.asarray(_vertical(motion, time)) if has_vertical(motion) else None
 
 
 def why_not(status: Status) -> str:
-    """What is said of a response without a result: "no result", and why, in a few words; otherwise nothing."""
+    """Return a short reason for a response without a result, "no result: ..."; otherwise an empty string."""
     if bool(np.asarray(status == Status.successful)):
         return ""
     reason = re.split("[,:.]", Status[status])[0]
@@ -98,14 +98,14 @@ def _say_why_not(axis: "Axes", status: Status) -> None:
 
 
 def _ink() -> str:
-    """The colour of text, which is seen on any background."""
+    """Return matplotlib's colour of text, which is legible on the background in use."""
     import matplotlib
 
     return matplotlib.rcParams["text.color"]
 
 
 def _dense(response: Response) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Time [s], rotation over alpha and velocity over p alpha, finely enough for the corners at impacts."""
+    """Return time [s], rotation over alpha and velocity over p alpha, dense enough for the corners at impacts."""
     scene = response.scene
     time = _times_of(response, scene.motion)
     rotation, velocity = response(time)
@@ -117,17 +117,17 @@ def _dense(response: Response) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 def history(response: Response | FlexibleResponse, axes: "Sequence[Axes] | None" = None) -> "Sequence[Axes]":
     """Draw rotation over alpha, velocity over p alpha and ground acceleration against time, impacts marked.
 
-    A vertical acceleration is drawn beside the horizontal one, and changes the threshold; a response without a result
-    is called so above.
+    A vertical acceleration is drawn with the horizontal one, and changes the threshold. A title marks a response
+    without a result.
 
     **Arguments:**
 
-    - `response`: result of `simulate`; of a flexible block the displacement of its top, and the part of it that is
-      bending, take the place of the velocity.
+    - `response`: result of `simulate`. For a flexible block, the displacement of its top, and the bending part of it,
+      replace the velocity.
     - `axes`: three matplotlib axes; None makes a figure.
 
-    **Returns:** the three axes. Of an asymmetric block alpha is the smaller slenderness angle, and each way has its own
-    threshold.
+    **Returns:** the three axes. For an asymmetric block alpha is the smaller slenderness angle, and each direction has
+    its own threshold.
 
     **Raises:** ValueError for the response of many scenes.
     """
@@ -158,14 +158,14 @@ def history(response: Response | FlexibleResponse, axes: "Sequence[Axes] | None"
         label, level = "uplift threshold" if side > 0 else None, -side * float(moments.threshold)
         if vertical is None:
             axes[2].axhline(level, color=SAND, linewidth=0.9, label=label)
-        else:  # what presses the block down holds it, too
+        else:  # upward acceleration adds to gravity, and raises the threshold
             axes[2].plot(shaken, level * (1 + vertical), color=SAND, linewidth=0.9, label=label)
     axes[0].set_ylabel(r"rotation $\theta/\alpha$")
     axes[1].set_ylabel(r"velocity $\dot\theta/(p\alpha)$")
     axes[2].set_ylabel("ground\nacceleration [g]")
     axes[2].set_xlabel("time [s]")
     axes[0].legend(loc="upper right", fontsize=8, frameon=False)
-    axes[2].legend(loc="upper right", fontsize=8, framealpha=0.9, edgecolor="none")  # the lines go through it
+    axes[2].legend(loc="upper right", fontsize=8, framealpha=0.9, edgecolor="none")  # lines pass below the legend
     return axes
 
 
@@ -196,7 +196,10 @@ def _manifolds(moments: Coefficients, opening):
 
 
 def _manifold(axis: "Axes", moments: Coefficients, side: int, alpha: float) -> float:
-    """The stable manifold of the upright saddle of a side, and the unstable one, dotted; and the speed upright."""
+    """Draw the stable manifold of the upright saddle of a side, and the unstable one, dotted.
+
+    Return the normalised speed of the manifold at zero rotation.
+    """
     opening = np.linspace(0, 2 * max(1.0, float(moments.saddle) / alpha), 101)
     manifold = np.asarray(_manifolds(moments, opening * alpha)) / alpha
     label = "stable manifold" if side > 0 else None
@@ -214,8 +217,8 @@ def phase(response: Response | FlexibleResponse, axis: "Axes | None" = None) -> 
     - `response`: result of `simulate`.
     - `axis`: matplotlib axis; None makes a figure.
 
-    **Returns:** the axis. Without forcing, a block outside the band between the manifolds overturns. Of an `Equation`,
-    which is functions, the equilibria are drawn alone.
+    **Returns:** the axis. Without forcing, a block outside the band between the manifolds overturns. For an `Equation`,
+    which is defined by functions, only the equilibria are drawn.
 
     **Raises:** ValueError for the response of a flexible block, or of many scenes.
     """
@@ -239,7 +242,7 @@ def phase(response: Response | FlexibleResponse, axis: "Axes | None" = None) -> 
     saddles, speed = {}, 1.0
     for side, moments in zip((1, -1), scene.both_moments):
         saddles[side] = float(moments.saddle) / alpha
-        if isinstance(moments, Coefficients):  # of functions no manifold is known
+        if isinstance(moments, Coefficients):  # moments given by functions have no known manifold
             speed = max(speed, _manifold(axis, moments, side, alpha))
         axis.plot([side * saddles[side]], [0], "o", color=RED, markersize=4)
     axis.axvline(0, color=GREY, linewidth=0.5)

@@ -21,7 +21,7 @@ def slenderness(rock: Rock, axes: "Sequence[Axes] | None" = None, *, points: int
 
     - `rock`: a `Rock`.
     - `axes`: two polar axes of matplotlib; None makes a figure.
-    - `points`: azimuths.
+    - `points`: number of azimuths.
 
     **Returns:** the axes: of the slenderness towards each azimuth [rad], and of p about the point there [rad/s].
     """
@@ -48,15 +48,15 @@ def slenderness(rock: Rock, axes: "Sequence[Axes] | None" = None, *, points: int
 
 @figure(1)
 def righting(rock: Rock, azimuth: float = 0.0, axis=None):
-    """Draw what rights a rock that opens towards an azimuth: the arm of its weight over the opening angle.
+    """Draw the righting arm of a rock that rotates towards an azimuth: the arm of its weight over the opening angle.
 
     **Arguments:**
 
     - `rock`: a `Rock`; `azimuth`: as in `Rock.section`, towards the right.
     - `axis`: of matplotlib; None makes a figure.
 
-    **Returns:** the axis: the arm [m] of the rock itself, as it lies on its vertices in turn, that of the smooth edge
-    of `Rock.edges`, and those of the narrow and the wide base, which bound them.
+    **Returns:** the axis. Curves are the arms [m] of the rock itself, as it rests on its vertices in turn, and of the
+    smooth edge of `Rock.edges`. Those of the narrow and the wide base bound them.
     """
     import matplotlib.pyplot as plt
 

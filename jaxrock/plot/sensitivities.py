@@ -28,8 +28,8 @@ def tornado(sensitivity: Sensitivity, result: str = "max_rotation", axis: "Axes 
 
     **Returns:** the axis.
 
-    **Raises:** ValueError for many scenes, and for a result without elasticities, as the peaks of a block that
-    overturns are.
+    **Raises:** ValueError for many scenes, and for a result without elasticities, such as the peaks of a block that
+    overturns.
     """
     import matplotlib.pyplot as plt
 
@@ -64,7 +64,7 @@ def sensitivity_map(
 ) -> "Axes":
     """Draw the elasticity of one result by one parameter over pulse duration and uplift strength.
 
-    Blocks that overturn, and responses that are not smooth there, are left grey.
+    Points of the map where blocks overturn, or where the response is not smooth, are left grey.
 
     **Arguments:**
 
@@ -103,11 +103,11 @@ def critical(
 ) -> "Axes":
     """Draw all intensities at which blocks begin or cease to overturn, for many scenes side by side.
 
-    Scenes of which not all could be computed (`Critical.complete`) have a cross on the lower axis.
+    Scenes that were not computed at all intensities (`Critical.complete`) have a cross on the lower axis.
 
     **Arguments:**
 
-    - `abscissa`: (scenes,) what the scenes differ by, such as periods [s].
+    - `abscissa`: (scenes,) the quantity by which the scenes differ, such as periods [s].
     - `ends`: result of `critical_amplitudes` for many scenes.
     - `axis`: matplotlib axis; None makes a figure.
     - `label`: of the axis across, such as "period [s]".

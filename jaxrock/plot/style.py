@@ -14,16 +14,16 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 BLUE, RED, GREY, SAND = "#1f5a8a", "#b3352c", "#8a8a8a", "#d9a441"
-DURATION, RATIO = "pulse duration $p\\,t_d$", r"frequency ratio $\omega/p$"  # by which axes over them are known
-STRENGTH, INTENSITY = "uplift strength", "intensity"  # with which labels of axes begin that have them upward
+DURATION, RATIO = "pulse duration $p\\,t_d$", r"frequency ratio $\omega/p$"  # labels that identify horizontal axes
+STRENGTH, INTENSITY = "uplift strength", "intensity"  # beginnings of labels that identify vertical axes
 
 Drawing = TypeVar("Drawing", bound=Callable)
 
 
 def figure(count: int) -> Callable[[Drawing], Drawing]:
-    """Decorate a function that draws into `axis`, or into so many `axes`: all that it is given is checked first.
+    """Decorate a function that draws into `axis`, or into `count` `axes`, to check its arguments.
 
-    **Raises:** ValueError, when it is called, for an argument that is not what is asked for.
+    **Raises:** ValueError, when the function is called, for an invalid argument.
     """
 
     def decorate(function: Drawing) -> Drawing:
@@ -60,7 +60,7 @@ def log_ticks(axis: "Axes") -> "Axes":
 
     **Arguments:**
 
-    - `axis`: matplotlib axis; what is not logarithmic in it is left alone.
+    - `axis`: matplotlib axis; its linear axes are left unchanged.
 
     **Returns:** the axis.
     """
@@ -80,7 +80,7 @@ def log_ticks(axis: "Axes") -> "Axes":
 
 
 def broken_curve(axis, abscissa, values, **line):
-    """Draw a curve that has gaps, such as a spectrum where blocks overturn: what stands alone in a gap is a dot.
+    """Draw a curve that has gaps, such as a spectrum where blocks overturn; a single point between gaps is a dot.
 
     **Arguments:**
 
@@ -94,14 +94,17 @@ def broken_curve(axis, abscissa, values, **line):
     values = np.where(np.isfinite(values), values, np.nan)
     (drawn,) = axis.plot(abscissa, values, **line)
     there = np.pad(np.isfinite(values), 1)
-    alone = there[1:-1] & ~there[:-2] & ~there[2:]  # survivors between overturned blocks, of which no line is drawn
+    alone = there[1:-1] & ~there[:-2] & ~there[2:]  # survivors between overturned blocks, which a line does not show
     axis.plot(abscissa[alone], values[alone], ".", color=drawn.get_color(), markersize=4)
     return drawn
 
 
 def cell_edges(places: np.ndarray) -> np.ndarray:
-    """Where the cells about places that rise, or fall, begin and end: half way between them; one alone is as wide as a
-    tenth of what it is. Cells of positive places are positive, for logarithmic axes."""
+    """Return the edges of the cells about places that rise, or fall: halfway between the places.
+
+    The cell of a single place is a tenth of its value wide. Cells of positive places are positive, for logarithmic
+    axes.
+    """
     if places.size == 1:
         return places[0] + np.array([-1, 1]) * (0.05 * abs(places[0]) or 0.5)
     inner = (places[1:] + places[:-1]) / 2
@@ -111,17 +114,17 @@ def cell_edges(places: np.ndarray) -> np.ndarray:
 
 
 def in_order(places) -> tuple[np.ndarray, np.ndarray]:
-    """Places as they rise, each once, and where they were: of two that are alike neither would have a cell."""
+    """Return the sorted unique places, and their original indices; of two equal places neither would have a cell."""
     return np.unique(np.asarray(places), return_index=True)
 
 
 def draw_cells(axis: "Axes", across: np.ndarray, up: np.ndarray, values: np.ndarray, **style):
-    """Draw values (up, across) as cells about places that rise, or fall: those of a single one have a width, too."""
+    """Draw values (up, across) as cells about places that rise, or fall; a single place has a cell, too."""
     return axis.pcolormesh(cell_edges(across), cell_edges(up), values, rasterized=True, **style)
 
 
 def limits_of(places: np.ndarray) -> tuple[float, float]:
-    """From where to where an axis shows places that rise: the first and the last, or the cell of a single one."""
+    """Return the limits of an axis over places that rise: the first and the last, or the cell of a single place."""
     ends = cell_edges(places) if places.size == 1 else places
     return float(ends[0]), float(ends[-1])
 

@@ -30,8 +30,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 _LOG = logging.getLogger("jaxrock")
-_SCENES = 500_000  # that exact borders of a figure may take: more than those of any pulse but the longest
-_SAFE = ("#faf7ee", "#c4a35a")  # survivors, from those at rest to those that come to balance
+_SCENES = 500_000  # most scenes for exact borders of a figure: enough for all pulses except the longest
+_SAFE = ("#faf7ee", "#c4a35a")  # survivors, from those at rest to those that nearly overturn
 _STATES = ("black", BLUE, RED)  # not computed, overturned without impact, overturned after impacts
 
 
@@ -39,13 +39,13 @@ _STATES = ("black", BLUE, RED)  # not computed, overturned without impact, overt
 def spectrum(result: Spectrum, axes: "Sequence[Axes] | None" = None, *, by_duration: bool = False) -> "Sequence[Axes]":
     """Draw a rocking spectrum: peak rotation and peak velocity; sizes that overturn are shaded.
 
-    What was not computed (see `status`) is a gap, with a cross on the lower axis.
+    A response that was not computed (see `status`) is a gap, with a cross on the lower axis.
 
     **Arguments:**
 
     - `result`: from `rocking_spectrum` or `self_similar_spectrum`, without further axes.
     - `axes`: two matplotlib axes; None makes a figure.
-    - `by_duration`: of a self-similar spectrum: over the pulse duration, one curve per uplift strength.
+    - `by_duration`: whether to draw a self-similar spectrum over the pulse duration, one curve per uplift strength.
 
     **Returns:** the two axes.
 
@@ -80,7 +80,7 @@ def spectrum(result: Spectrum, axes: "Sequence[Axes] | None" = None, *, by_durat
     across = DURATION if by_duration else RATIO
     axes[1].set_xlabel(across if self_similar else r"$2\pi/p$ [s]")
     if self_similar or axes[0].get_legend_handles_labels()[0]:
-        many = own and len(lost) > 4  # would hide what it lies on
+        many = own and len(lost) > 4  # a long legend would hide the curves: place it outside
         axes[0].legend(
             title=("uplift strength" if by_duration else "intensity") if self_similar else None,
             fontsize=8, title_fontsize=8, framealpha=0.85, edgecolor="none",
@@ -90,14 +90,14 @@ def spectrum(result: Spectrum, axes: "Sequence[Axes] | None" = None, *, by_durat
 
 
 def _curves(axis: "Axes", abscissa: np.ndarray, rows: np.ndarray, labels) -> None:
-    """Curves of a spectrum; what is not a number was not computed, and gets a cross on the lower axis."""
+    """Draw the curves of a spectrum; NaN was not computed, and gets a cross on the lower axis."""
     import matplotlib.pyplot as plt
 
     colors = plt.colormaps["viridis"](np.linspace(0, 0.85, len(rows))) if len(rows) > 1 else [BLUE]
     for i, (curve, color) in enumerate(zip(rows, colors)):
         label = None if labels is None else f"{float(labels[i]):g}"
         broken_curve(axis, abscissa, curve, color=color, linewidth=1, label=label)
-    axis.update_datalim([(abscissa[0], 0)])  # upward from zero, as long as the axis is not made logarithmic
+    axis.update_datalim([(abscissa[0], 0)])  # start at zero, unless the user makes the axis logarithmic
     axis.lines[-1].sticky_edges.y.append(0)
     axis.autoscale_view()
     said: str | None = "not computed"
@@ -125,13 +125,13 @@ def overturning(
 
     - `result`: from `overturning_map`, without further axes.
     - `axis`: matplotlib axis; None makes a figure.
-    - `by_duration`: uplift strength over pulse duration, as single-lobe pulses are drawn, in place of intensity over
-      frequency ratio.
-    - `exact`: whether borders are drawn where they are (`overturning_borders`: islands and gaps too, whatever the grid;
-      pixels remain where islands are too many, or the search failed) or pixels alone; None: borders where the series
-      engine solves the map, if they take half a million scenes at most.
+    - `by_duration`: whether to draw uplift strength over pulse duration, as is usual for single-lobe pulses, in place
+      of intensity over frequency ratio.
+    - `exact`: whether to draw exact borders (`overturning_borders`), or pixels alone. Borders include islands and gaps
+      of any size; pixels remain where there are too many islands, or the search failed. None: borders if the series
+      engine solves the map, and if they take half a million scenes at most.
     - `safe`: whether survivors are coloured, with a scale beside the axis.
-    - `progress`: whether to draw a progress bar while borders are looked for; None: on a terminal, if it takes long.
+    - `progress`: whether to draw a progress bar during the search for borders; None: on a terminal, if it takes long.
 
     **Returns:** the axis.
 
@@ -176,7 +176,7 @@ def overturning(
 
 
 def _borders_of(result: OverturningMap, exact: bool | None, progress: bool | None) -> Borders | None:
-    """Where borders are drawn as they are: asked for, or quickly found where nothing is said."""
+    """Return exact borders if `exact`, or if it is None and they are found quickly; otherwise None."""
     if exact:
         return overturning_borders(result, progress=progress)
     if exact is False or not _is_quick(result):
@@ -188,7 +188,7 @@ def _borders_of(result: OverturningMap, exact: bool | None, progress: bool | Non
 
 
 def _explain_states(axis: "Axes", state: np.ndarray, place: str) -> None:
-    """A legend of verdicts; of "not computed" where there are such."""
+    """Draw a legend of verdicts, with "not computed" only where it occurs."""
     from matplotlib.patches import Patch
 
     names = {-1: "not computed", 0: "safe", 1: "overturned without impact", 2: "overturned after impacts"}
@@ -199,7 +199,7 @@ def _explain_states(axis: "Axes", state: np.ndarray, place: str) -> None:
 
 
 def draw_region(axis: "Axes", region: Region, by_duration: bool = False) -> None:
-    """A region of overturned blocks between its borders."""
+    """Draw a region of overturned blocks between its borders."""
     x, edges = np.asarray(region.frequency_ratio), (region.lower, region.upper)
     if by_duration:
         x, edges = 2 * np.pi / x, tuple(1 / edge for edge in edges)
@@ -219,16 +219,16 @@ def borders(
     progress: bool | None = None,
     **line: Any,
 ) -> "Axes":
-    """Draw the borders of an overturning map alone: to lay several over each other.
+    """Draw the borders of an overturning map alone, so that several maps can share an axis.
 
-    Those in the ranges that `overturning_borders` calls crowded are not all drawn; then the log says so.
+    Borders in the ranges that `overturning_borders` reports as crowded are not all drawn; the log then reports that.
 
     **Arguments:**
 
     - `result`: as in `overturning`.
     - `axis`: matplotlib axis; None makes a figure.
-    - `by_strength`: uplift strength, one over the intensity, upward in place of the intensity.
-    - `scale`: factor on what is drawn upward.
+    - `by_strength`: whether to draw the uplift strength, one over the intensity, upward in place of the intensity.
+    - `scale`: factor on the quantity drawn upward.
     - `progress`: as in `overturning`.
     - `line`: colour, style, width and label, as matplotlib names them.
 
@@ -266,13 +266,13 @@ def _is_quick(result: OverturningMap) -> bool:
 
 
 def _within(x: np.ndarray, ranges: np.ndarray) -> np.ndarray:
-    """Which pixels lie in ranges, or reach into them."""
+    """Return for each pixel whether it lies in one of the ranges, or reaches into it."""
     half = np.abs(np.gradient(x)) / 2 if x.size > 1 else 0 * x
     return ((x[:, None] + half[:, None] > ranges[:, 0]) & (x[:, None] - half[:, None] < ranges[:, 1])).any(1)
 
 
 def _beyond(peaks: np.ndarray) -> np.ndarray:
-    """Peaks with those of the nearest survivors in the pixels that borders cut."""
+    """Return peaks with NaN replaced by the largest neighbour, so that survivors' colours reach up to the borders."""
     around = np.pad(peaks, 1, constant_values=np.nan)
     n, m = peaks.shape
     moved = [around[i : i + n, j : j + m] for i in range(3) for j in range(3)]
