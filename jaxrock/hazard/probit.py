@@ -66,8 +66,8 @@ class ProbitFit(AbstractTable):
     def useless(self) -> tuple[str, ...]:
         """Names of measures whose relation to toppling may be chance.
 
-        Their slope does not differ significantly from 0: `p_values` above 0.05, or NaN where measures are equivalent.
-        A single measure with a slope below 0 counts, too.
+        Their slope does not differ significantly from 0: `p_values` above 0.05, or NaN where a measure says the same as
+        another, or nothing. A single measure with a slope below 0 counts, too.
         """
         untold = ~(self.p_values <= 0.05)
         if len(self.names) == 1:
