@@ -1,7 +1,7 @@
 """What LLVM's effort costs and is worth: `python benchmarks/effort.py` writes `effort.md`.
 
 Fresh processes, with nothing kept, in turns: machine code by effort 0 and by effort 3
-(`jaxrock.native.machine.EFFORT`), with whether both answer the same to the bit.
+(`jaxrock.compiler.llvm.jit.EFFORT`), with whether both answer the same to the bit.
 """
 
 import hashlib
@@ -47,10 +47,10 @@ def ask(question, effort):
     jax.config.update("jax_enable_x64", True)
     import jaxrock as rk
     from jaxrock.closed_form import single_lobe
-    from jaxrock.native import machine
+    from jaxrock.compiler.llvm import jit
 
-    machine.EFFORT.update(dict.fromkeys(machine.EFFORT, effort))
-    compiled, of_llvm = machine._Machine.object_of, []
+    jit.EFFORT.update(dict.fromkeys(jit.EFFORT, effort))
+    compiled, of_llvm = jit._Machine.object_of, []
 
     def timed(*given):
         begun = time.process_time()
@@ -58,7 +58,7 @@ def ask(question, effort):
         of_llvm.append(time.process_time() - begun)
         return code
 
-    machine._Machine.object_of = timed
+    jit._Machine.object_of = timed
     names = {"rk": rk, "jax": jax, "jnp": jnp, "single_lobe": single_lobe}
     function, given = (eval(text, names) for text in QUESTIONS[question])
     function, begun = jax.jit(function), time.process_time()
@@ -98,7 +98,7 @@ Written by `python benchmarks/effort.py`, {surroundings()}.
 
 Machine code of one program, compiled by LLVM with effort 0 and 3: processor seconds of the first answer in a fresh
 process with nothing kept, of LLVM within it, and the least time of the answers after it; medians of {TIMES}, in turns.
-The package compiles what is of one lane with effort 0, all else with 3 (`jaxrock.native.machine.EFFORT`).
+The package compiles what is of one lane with effort 0, all else with 3 (`jaxrock.compiler.llvm.jit.EFFORT`).
 
 {table(heads, rows)}
 """

@@ -1,7 +1,7 @@
 """First fits, rates, peaks, estimates, histories and columns: `python benchmarks/fits.py` writes `fits.md`.
 
-Fresh processes, with nothing kept and XLA's own settings, in turns: compiled quickly (`jaxrock._quickly`), and as XLA
-compiles by itself.
+Fresh processes, with nothing kept and XLA's own settings, in turns: compiled with low effort
+(`jaxrock.compiler.hints.low_effort`), and as XLA compiles by itself.
 """
 
 import json
@@ -64,11 +64,11 @@ def ask(question, way):
 
     jax.config.update("jax_enable_x64", True)
     import jaxrock as rk
-    from jaxrock import _quickly
+    from jaxrock.compiler.hints import low_effort
     from jaxrock.sweeps import runner
 
     if way != WAYS[0]:
-        _quickly.MUCH = runner.MUCH = -1
+        low_effort.LOW_EFFORT_LIMIT = runner.LOW_EFFORT_LIMIT = -1
     draw = np.random.default_rng(1)
     x, y = (np.exp(draw.normal(mean, 0.5, ROWS)) for mean in (-1, -2))
     alpha, p = np.array([0.10, 0.13, 0.16, 0.20, 0.24]), np.array([3.0, 2.6, 3.4, 2.8, 3.2])
@@ -125,10 +125,10 @@ Written by `python benchmarks/fits.py`, {surroundings()}.
 Processor seconds of the first answer in a fresh process with nothing kept, and of the next, in a fit one to
 {OTHER} rows of outcomes after one to {ROWS}, which have room in one program; the least time of answers after that;
 medians of {TIMES}, in turns. Of known numbers, few and on a CPU, the package has XLA compile such programs quickly
-(`jaxrock._quickly`): without LLVM's effort and XLA's newer emitters; also where such a program follows scenes, if these
-are machine code, of flexible columns, which are not, and of sweeps of few points on one device that have no loops, or
-follow rigid blocks without machine code. The difference is the largest of any number of the answer, covariances too; of
-`estimate_motion` it is what a climb settles at.
+(`jaxrock.compiler.hints.low_effort`): without LLVM's effort and XLA's newer emitters. That holds also where such a
+program follows scenes, if these are machine code, of flexible columns, which are not, and of sweeps of few points on
+one device that have no loops, or follow rigid blocks without machine code. The difference is the largest of any number
+of the answer, covariances too; of `estimate_motion` it is what a climb settles at.
 
 {table(heads, rows)}
 """

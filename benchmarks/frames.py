@@ -1,7 +1,7 @@
 """What room for Python's frames is worth in first answers: `python benchmarks/frames.py` writes `frames.md`.
 
-Fresh processes, with nothing kept, in turns: as it is, and with `jaxrock._undisturbed.with_room` as a plain call. Pages
-that are touched for the first time tell what happens: there are no others.
+Fresh processes, with nothing kept, in turns: as it is, and with `jaxrock.compiler.tracing.with_stack` as a plain
+call. Pages that are touched for the first time tell what happens: there are no others.
 """
 
 import json
@@ -31,12 +31,12 @@ def ask(question, room):
     import jax.numpy as jnp
 
     import jaxrock as rk
-    from jaxrock import _undisturbed
-    from jaxrock.keeping import changes
+    from jaxrock.compiler import tracing
+    from jaxrock.compiler.cache import changes
 
     if not room:
-        code = _undisturbed.with_room.__code__
-        _undisturbed.with_room.__code__ = code.replace(co_stacksize=16)
+        code = tracing.with_stack.__code__
+        tracing.with_stack.__code__ = code.replace(co_stacksize=16)
         changes._seen.clear()  # else the package looks, again and again, for what has changed in it
         changes.changes()
     told = {"rk": rk, "jax": jax, "jnp": jnp, "block": rk.Block(0.2, 2.0)}
@@ -70,7 +70,7 @@ Written by `python benchmarks/frames.py`, {surroundings()}.
 
 First answers in fresh processes with nothing kept: medians of {TIMES}, in turns. CPython keeps frames in pieces of 16
 kB; where a loop of calls stands at the end of one, the next is asked for and given back at every turn (in releases of
-before 2026, gh-142183). While programs are traced and lowered all frames lie in one piece (`jaxrock._undisturbed`).
+before 2026, gh-142183). While programs are traced and lowered all frames lie in one piece (`jaxrock.compiler.tracing`).
 
 {table(["question", "room", "user [s]", "system [s]", "pages touched"], rows)}
 """

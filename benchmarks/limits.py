@@ -17,10 +17,10 @@ from peers_solvers import jaxrock_api
 from peers_solvers.report import surroundings
 
 import jaxrock as rk
+from jaxrock.compiler.primitive.macro import expand, is_macro
 from jaxrock.engines.taylor import expansion, fast
-from jaxrock.engines.taylor.follow import most_steps
-from jaxrock.engines.taylor.glide import Glide, onward, settled
-from jaxrock.numerics.compound import is_compound, written
+from jaxrock.engines.taylor.event_free_step import EventFreeSteps, flush_error, onward
+from jaxrock.engines.taylor.fast_loop import most_steps
 from jaxrock.responses import outcome
 from references import peer_problems as problems
 from references.in_jaxrock import MODELS
@@ -37,8 +37,8 @@ def operations(jaxpr, branches=False, found=None):
     for equation in jaxpr.eqns:
         values = [p for value in equation.params.values() for p in (value if isinstance(value, tuple) else (value,))]
         programs = [getattr(p, "jaxpr", p) for p in values if hasattr(getattr(p, "jaxpr", p), "eqns")]
-        if is_compound(equation.primitive.name):
-            programs = [written(equation.primitive.name, [x.aval for x in equation.invars], equation.params).jaxpr]
+        if is_macro(equation.primitive.name):
+            programs = [expand(equation.primitive.name, [x.aval for x in equation.invars], equation.params).jaxpr]
         if equation.primitive.name == "cond" and not branches:
             continue
         if not programs:
@@ -63,9 +63,9 @@ def scene_of(problem):
 
 def begun(problem, columns):
     """A scene at its start: what steps it, and its state."""
-    passes = outcome._passes(problem.motion == "record")
+    passes = outcome._OutcomePasses(rounds=problem.motion == "record")
     block, motion = scene_of(problem)(*columns)
-    return passes.begin((block, motion, MODELS[problem.model], (0.0, 0.0), rk.Series()))
+    return passes.init((block, motion, MODELS[problem.model], (0.0, 0.0), rk.Series()))
 
 
 def steps(problem):
@@ -78,10 +78,10 @@ def steps(problem):
         strongest = stepper.scene.outlook.strongest_drive
 
         def cared(state, glide):
-            state = settled(stepper, state, glide, strongest)
+            state = flush_error(stepper, state, glide, strongest)
             rests = state.side == 0
-            after = jax.lax.cond(rests, lambda: fast.wait(stepper, state), lambda: fast.advance(stepper, state))
-            return after, Glide.of(stepper, after)
+            after = jax.lax.cond(rests, lambda: fast.certain_wait(stepper, state), lambda: fast.advance(stepper, state))
+            return after, EventFreeSteps.of(stepper, after)
 
         def step(carry):
             (state, glide), rocking, waiting, careful = carry
@@ -97,7 +97,7 @@ def steps(problem):
         zero = jnp.int32(0)
         limit = most_steps(stepper.scene.most_pieces)
         going = lambda carry: ~carry[0][0].done & (carry[0][0].steps < limit)  # noqa: E731
-        first = (state, Glide.of(stepper, state))
+        first = (state, EventFreeSteps.of(stepper, state))
         return jax.lax.while_loop(going, step, (first, zero, zero, zero))[1:]
 
     drawn = np.random.default_rng(0).choice(problem.size, min(SAMPLE, problem.size), replace=False)
@@ -114,10 +114,10 @@ def counts(problem):
 
     def series(state):
         shaking, unit = stepper.shaking(state.piece, state.local)
-        return expansion.expand(stepper.start(state, shaking, unit), stepper.order).opening
+        return expansion.taylor_expansion(stepper.start(state, shaking, unit), stepper.order).opening
 
     def glided(state):
-        return onward(stepper, state, Glide.of(stepper, state))
+        return onward(stepper, state, EventFreeSteps.of(stepper, state))
 
     whole = functools.partial(fast.advance, stepper)
     of_series, of_step = (jax.make_jaxpr(f)(state).jaxpr for f in (series, whole))

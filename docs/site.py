@@ -29,7 +29,9 @@ def on_page_markdown(markdown, page, config, files):
     if page.file.src_uri == "api.md":
         return _with_examples(markdown)
     if page.file.generated_by is None:  # of this folder
-        markdown = re.sub(r"\]\(\.\./((?:\.\./)?(?:benchmarks|notebooks|CONTRIBUTING))", r"](\1", markdown)
+        markdown = re.sub(r"\]\(\.\./((?:\.\./)*(?:benchmarks|notebooks|CONTRIBUTING))", r"](\1", markdown)
+    else:  # beside this folder
+        markdown = re.sub(r"\]\(((?:\.\./)*)docs/", r"](\1", markdown)
     return re.sub(r"\[([^\]]+)\]\([^)]*\.(?:py|json)\)", r"\1", markdown)
 
 

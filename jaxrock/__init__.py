@@ -19,13 +19,12 @@ from jaxrock import (
     responses as responses,
     studies as studies,
 )
-from jaxrock._parameters import parameter as parameter
-from jaxrock._surface import shown as _shown
+from jaxrock._arguments.parameters import parameter as parameter
+from jaxrock._core.namespace import shown as _shown
 from jaxrock.blocks import restitution as restitution
 from jaxrock.blocks.rigid import Block as Block
+from jaxrock.compiler import cache as _cache
 from jaxrock.engines.taylor.careful import Series as Series
-from jaxrock.keeping.changes import changes as _changes
-from jaxrock.keeping.compiled import keep_compiled as keep_compiled
 from jaxrock.models.rigid import (
     Housner as Housner,
     Linear as Linear,
@@ -97,4 +96,12 @@ def __dir__() -> list[str]:
     return sorted({*_shown(globals(), *_NAMESPACES.split()), *_LATER, "Diffrax"})
 
 
-_changes()  # looks at what has been imported: what differs later was changed
+keep_compiled = _cache.keep_compiled
+_cache.watch(
+    pure=(
+        "blocks.asymmetric", "blocks.flexible", "blocks.restitution", "blocks.rigid", "closed_form", "engines.diffrax",
+        "engines.taylor", "models", "motions.pulses", "responses", "status",
+    ),
+    immutable=("blocks.edge", "blocks.rock", "motions.motion", "motions.record"),
+    without_programs=("compiler.cache", "sweeps", "plot", "command_line"),
+)  # fmt: skip

@@ -1,4 +1,4 @@
-"""What became of a computation: every result carries one of these."""
+"""Status of a computation, which every result carries."""
 
 from typing import TYPE_CHECKING, Any
 
@@ -7,15 +7,16 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool
 
-from jaxrock._checks import is_traced
+from jaxrock._core.arrays import is_traced
+from jaxrock.compiler import checks
 
-if TYPE_CHECKING:  # of Equinox's own declaration some checkers think that its items are words
+if TYPE_CHECKING:  # some checkers take items of Equinox's own declaration for strings
     from typing import Self, TypeVar
 
     Kind = TypeVar("Kind")
 
     class item:
-        """What checkers see of an item: an instance of its class."""
+        """An item as checkers see it: an instance of its class."""
 
         def __init__(self, message: str) -> None: ...
         def __get__(self, instance: object, owner: type[Kind]) -> Kind: ...
@@ -24,7 +25,7 @@ if TYPE_CHECKING:  # of Equinox's own declaration some checkers think that its i
         def __getitem__(cls, item: Any) -> str: ...
 
     class Enumeration(metaclass=_Items):
-        """What checkers see of `equinox.Enumeration`: items, alone or in arrays, that compare to arrays."""
+        """`equinox.Enumeration` as checkers see it: items, alone or in arrays, that compare to arrays."""
 
         def __eq__(self, other: object) -> Bool[Array, "..."]: ...  # type: ignore[override]
         def __ne__(self, other: object) -> Bool[Array, "..."]: ...  # type: ignore[override]
@@ -60,15 +61,11 @@ class Status(Enumeration):
     )
 
 
-def is_none(given: Any) -> Bool[Array, ""]:
-    """Return whether any floating-point input is NaN."""
-    numbers = [x for x in jax.tree.leaves(given) if jnp.issubdtype(jnp.result_type(x), jnp.inexact)]
-    return jnp.stack([jnp.isnan(x).any() for x in numbers] or [jnp.asarray(False)]).any()
-
-
 def still_where(lost: Bool[Array, ""], values: Any) -> Any:
-    """The values, which nothing moves where `lost`: in reverse mode slopes that are no numbers end here. What many
-    scenes share they go on to share."""
+    """Return values whose tangents are zero where `lost`: in reverse mode, NaN cotangents end here.
+
+    A value that many scenes share stays shared.
+    """
 
     def of(x):
         return _still_where(lost, x) if jnp.issubdtype(jnp.result_type(x), jnp.inexact) else x
@@ -88,21 +85,8 @@ def _still_where_jvp(primals, tangents):
 
 
 def still_if_none(given: Any) -> Any:
-    """What is given to an engine, which has no slopes if a number of it is none."""
-    return still_where(is_none(given), given) if is_traced(given) else given
+    """Return the arguments of an engine, with zero tangents if any number among them is NaN."""
+    return still_where(checks.any_nan(given), given) if is_traced(given) else given
 
 
-@jax.jit
-def marked_result(result: Any, given: Any) -> Any:
-    """A result as it is, unless a number that was given is none: then none of the result is, and its status says so.
-
-    An engine may pass by a number that it does not come to need, and what it returns may look like a result.
-    """
-    bad = is_none(given)
-
-    def of(part):
-        if isinstance(part, Status):
-            return Status.where(bad, Status.not_finite, part)
-        return jnp.where(bad, jnp.nan, part) if jnp.issubdtype(jnp.result_type(part), jnp.inexact) else part
-
-    return jax.tree.map(of, result, is_leaf=lambda part: isinstance(part, Status))
+checks.declare_status(Status, Status.not_finite)

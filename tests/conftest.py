@@ -31,7 +31,8 @@ def checked_modules():
     """Modules of the package (not imported yet) whose annotations are checked."""
     package = Path(importlib.util.find_spec("jaxrock").origin).parent
     for path in sorted(package.rglob("*.py")):
-        shapes = "from jaxtyping import" in path.read_text()
+        text = path.read_text()
+        shapes = "from jaxtyping import" in text or "from jaxrock._core.types import" in text
         if _CHECK_ALL or shapes:
             yield ".".join(["jaxrock", *path.relative_to(package).with_suffix("").parts])
 
@@ -65,7 +66,7 @@ def pytest_configure(config):
     gc.set_threshold(1_000_000, 10, 10)
     quickly = "XLA_FLAGS" not in os.environ
     if quickly:
-        importlib.import_module("jaxrock.keeping.compiled").compile_quickly()
+        importlib.import_module("jaxrock.compiler.cache.enable").compile_quickly()
         fewer = ("simplify-while-loops", "while-loop-invariant-code-motion", "while-loop-constant-sinking")
         flags = (
             "--xla_backend_optimization_level=0",
@@ -77,7 +78,7 @@ def pytest_configure(config):
     if quickly and jax.__version_info__ < (0, 12):
         _share_contexts(importlib.import_module("jax._src.interpreters.mlir"))
     if quickly and importlib.util.find_spec("llvmlite"):
-        importlib.import_module("jaxrock.native.machine").EFFORT["for long"] = 0
+        importlib.import_module("jaxrock.compiler.llvm.jit").EFFORT["for long"] = 0
     jax.config.update("jax_compilation_cache_dir", os.environ[_PLACE])
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
@@ -146,7 +147,7 @@ def pytest_runtest_teardown(item, nextitem):
     most = max(_WITHIN if goes_on else _AFTER_A_FILE, _held[0] + _LEAST_GROWTH)
     if not _has_many_maps() and _memory() <= most:
         return
-    importlib.import_module("jaxrock.transforms.recipe").forget_programs()
+    importlib.import_module("jaxrock.compiler.primitive.lane_function").forget_programs()
     importlib.import_module("jax").clear_caches()
     gc.collect()  # it is told to look seldom, and much waits for it
     gc.freeze()  # what is left stays for long
@@ -161,7 +162,7 @@ def pytest_runtest_protocol(item, nextitem):
 
     Plugins that run tests in another way (again, if they fail) are not asked.
     """
-    return importlib.import_module("jaxrock._undisturbed").with_room(protocol, item, nextitem)
+    return importlib.import_module("jaxrock.compiler.tracing").with_stack(protocol, item, nextitem)
 
 
 def pytest_collection_finish():

@@ -11,8 +11,9 @@ import pytest
 
 import jaxrock as rk
 from jaxrock.blocks.asymmetric import AsymmetricBlock
+from jaxrock.compiler import trace_function
+from jaxrock.compiler.jaxpr.traced_function import TracedFunction
 from jaxrock.responses.current_model import current_model
-from jaxrock.transforms.user_function import UserFunction, current_function
 
 COMPILED = []
 jax.monitoring.register_event_duration_secs_listener(
@@ -263,8 +264,8 @@ NUMBER = jax.ShapeDtypeStruct((), np.dtype(float))
 def test_programs_are_equal_and_arrays_are_not(way):
     """Check for any two sizes that programs are equal and arrays are not, so that nothing is compiled again."""
     function, change = way(lambda size, x: jnp.sum(jnp.asarray(size)) * jnp.cos(x))
-    before, same = (current_function(function, NUMBER) for _ in range(2))
-    after = current_function(change() or function, NUMBER)
+    before, same = (trace_function(function, NUMBER) for _ in range(2))
+    after = trace_function(change() or function, NUMBER)
     assert jax.tree.structure(before) == jax.tree.structure(same) == jax.tree.structure(after)
     for found, size in ((before, 1.0), (same, 1.0), (after, 2.0)):
         assert float(jax.jit(lambda f: f(0.5))(found)) == pytest.approx(size * np.cos(0.5), rel=1e-15)
@@ -273,9 +274,9 @@ def test_programs_are_equal_and_arrays_are_not(way):
 def test_numbers_are_part_of_the_program():
     size = 0.1
     function = lambda x: size * x
-    before = current_function(function, NUMBER)
+    before = trace_function(function, NUMBER)
     size = np.nextafter(0.1, 1)
-    after = current_function(function, NUMBER)
+    after = trace_function(function, NUMBER)
     assert jax.tree.structure(before) != jax.tree.structure(after)
     assert float(before(1.0)) != float(after(1.0)) == size
 
@@ -284,8 +285,8 @@ def test_what_was_traced_stays_as_it_was():
     """Also what it has captured of NumPy, and if it is a single number, or held by a function that JAX has compiled."""
     array, number = np.ones(3), np.array(2.0)
     compiled = jax.jit(lambda x: jnp.sum(array) * x)
-    found = current_function(lambda x: array[1:] @ array[1:] * x + number * x + jnp.sum(array) * x, NUMBER)
-    inner = current_function(lambda x: compiled(x), NUMBER)
+    found = trace_function(lambda x: array[1:] @ array[1:] * x + number * x + jnp.sum(array) * x, NUMBER)
+    inner = trace_function(lambda x: compiled(x), NUMBER)
     array[...], number[...] = 7.0, 9.0
     assert float(found(1.0)) == 2.0 + 2.0 + 3.0
     assert float(inner(1.0)) == 3.0
@@ -298,7 +299,7 @@ def test_other_rules_of_derivatives_are_another_program():
             return 2 * x
 
         function.defjvp(lambda p, t: (function(*p), slope * t[0]))
-        return current_function(function, NUMBER)
+        return trace_function(function, NUMBER)
 
     one, same, other = with_slope(1.0), with_slope(1.0), with_slope(3.0)
     assert jax.tree.structure(one) == jax.tree.structure(same) != jax.tree.structure(other)
@@ -307,7 +308,7 @@ def test_other_rules_of_derivatives_are_another_program():
 
 def test_traced_values_are_captured_with_their_derivatives():
     def of(size):
-        found = current_function(lambda x: size * x**2, NUMBER)
+        found = trace_function(lambda x: size * x**2, NUMBER)
         return jax.jit(lambda f, x: f(x))(found, 3.0)
 
     assert float(jax.grad(of)(2.0)) == 9.0
@@ -357,7 +358,7 @@ def test_a_model_that_holds_an_equation():
             return False
 
     model = current_model(Stiffer(rk.models.Equation(sine)), BLOCK)
-    assert isinstance(model.inner._acceleration, UserFunction)
+    assert isinstance(model.inner._acceleration, TracedFunction)
     assert current_model(model, BLOCK) is model
     assert current_model(rk.Housner(), BLOCK) == rk.Housner()
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 import jaxrock as rk
-from jaxrock._checks import is_traced
-from jaxrock.engines import outlook
+from jaxrock._core.arrays import is_traced
+from jaxrock.engines import remaining_forcing
 from jaxrock.engines.scene import Scene
 from jaxrock.motions.joined_records import Chosen, JoinedRecords
 
@@ -246,4 +246,4 @@ def test_largest_values_from_each_piece_on(count):
     """Check the largest values of the next 16, the next 256, and all later pieces."""
     values = np.abs(np.random.default_rng(count).normal(size=count)) * np.exp(-np.arange(count) / count)
     wanted = [[values[i : i + most].max() for i in range(count)] for most in (count, 16, 256)]
-    np.testing.assert_array_equal(jax.jit(outlook._maxima)(values), wanted)
+    np.testing.assert_array_equal(jax.jit(remaining_forcing._maxima)(values), wanted)

@@ -26,7 +26,7 @@ from jaxrock.command_line.fragility import _entries, _write
 from jaxrock.command_line.main import main
 from jaxrock.command_line.options import add_pulse, extent_of, files_of, pulse_of
 from jaxrock.command_line.output import Entry, heard
-from jaxrock.command_line.results import KNOWN, ResultFolder
+from jaxrock.command_line.results import HASH_FILE, ResultFolder
 from jaxrock.inverse.observation_files import EXAMPLE
 from jaxrock.motions.pulses import PULSES
 
@@ -223,7 +223,7 @@ def test_a_file_is_there_whole_or_not_at_all(monkeypatch, tmp_path, kind):
     monkeypatch.setattr(np, "savetxt", half)
     figure, given = types.SimpleNamespace(savefig=half), (output.Report("map", quiet=True), ResultFolder(tmp_path))
     with pytest.raises(OSError, match=r"map.png cannot be written: No space left on device"):
-        output.write_csv(*given, "map.png", "x", [1.0]) if kind == "table" else output.save(*given, "map.png", figure)
+        output.write_table(*given, "map.png", "x", [1.0]) if kind == "table" else output.save(*given, "map.png", figure)
     assert not list(tmp_path.iterdir())
 
 
@@ -297,7 +297,7 @@ def test_spectral_velocities_are_not_written_for_openquake(tmp_path, monkeypatch
     report = output.Report("fragility")
     _write(report, argparse.Namespace(out=ResultFolder(tmp_path)), found, rk.hazard.LogNormalFragility(0.3, 0.4))
     assert "no fragility.xml: OpenQuake knows no SV(0.5)" in capsys.readouterr().out
-    assert {path.name for path in tmp_path.iterdir()} == {"fragility.csv", "stripes.csv", "fragility.png", KNOWN}
+    assert {path.name for path in tmp_path.iterdir()} == {"fragility.csv", "stripes.csv", "fragility.png", HASH_FILE}
 
 
 def test_no_unexceeded_motion_of_an_earlier_run(tmp_path, monkeypatch):
@@ -314,7 +314,7 @@ def test_no_unexceeded_motion_of_an_earlier_run(tmp_path, monkeypatch):
     with ResultFolder(tmp_path).whole("unexceeded.csv") as aside:
         aside.write_text("of an earlier run")
     files = invert._write(ResultFolder(tmp_path), observations, estimate, region, None)
-    assert sorted([tmp_path / KNOWN, *files]) == sorted(tmp_path.iterdir())
+    assert sorted([tmp_path / HASH_FILE, *files]) == sorted(tmp_path.iterdir())
 
 
 def test_spectrum(command, column, tmp_path):

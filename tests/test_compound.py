@@ -14,17 +14,15 @@ import pytest
 from jax.extend.core import jaxpr_as_fun
 
 import jaxrock as rk
+from jaxrock.compiler import custom_tangent, lane_function
+from jaxrock.compiler.autodiff.jvp_jaxpr import jvp_jaxpr
+from jaxrock.compiler.hints import as_dtype, common_type, select, stop_gradient
+from jaxrock.compiler.hints.materialize import with_hints
+from jaxrock.compiler.primitive import macro
 from jaxrock.engines import free_stage
-from jaxrock.numerics import compound, elementary, polynomial as polynomials
-from jaxrock.numerics.choice import where
+from jaxrock.numerics import elementary, polynomial as polynomials
 from jaxrock.numerics.exponential_sums import powers
-from jaxrock.numerics.fixed import fixed
-from jaxrock.numerics.given import given
 from jaxrock.numerics.roots import implicit
-from jaxrock.numerics.typed import common_type, typed
-from jaxrock.numerics.xla_cpu import marking
-from jaxrock.transforms.differentiation import differentiable
-from jaxrock.transforms.pushforward import pushed
 
 RNG = np.random.default_rng(7)
 NUMBERS = RNG.uniform(0.1, 1.2, 12)
@@ -58,8 +56,8 @@ def numbers_for(count):
 def written_of(operation, settings, numbers):
     """The operation's name, and what it consists of as a program."""
     program = jax.make_jaxpr(lambda *x: operation(*x, **settings))(*numbers)
-    (equation,) = (e for e in program.jaxpr.eqns if compound.is_compound(e.primitive.name))
-    return compound.written(equation.primitive.name, [x.aval for x in equation.invars], equation.params)
+    (equation,) = (e for e in program.jaxpr.eqns if macro.is_macro(e.primitive.name))
+    return macro.expand(equation.primitive.name, [x.aval for x in equation.invars], equation.params)
 
 
 @each
@@ -142,19 +140,19 @@ def test_in_single_precision_after_double(operation, settings, count):
     for double in (True, False):
         with jax.enable_x64(double):
             program = jax.make_jaxpr(lambda *x: operation(*x, **settings))(*numbers)
-            jax.make_jaxpr(lambda *x, of=program: pushed(of, x, [True] * count, x, None))(*numbers)
+            jax.make_jaxpr(lambda *x, of=program: jvp_jaxpr(of, x, [True] * count, x, None))(*numbers)
 
 
 @each
 def test_machine_code_is_the_same(operation, settings, count):
-    call = pytest.importorskip("jaxrock.native.call", reason="needs llvmlite")
+    call = pytest.importorskip("jaxrock.compiler.llvm.compiled_program", reason="needs llvmlite")
     numbers = numbers_for(count)
     lanes = [np.linspace(0.8, 1.2, 21) * x for x in numbers]
 
     def of(*numbers):
         return operation(*numbers, **settings)
 
-    plan = call.Plan(jax.make_jaxpr(of)(*numbers), [False] * count)
+    plan = call.CompiledProgram(jax.make_jaxpr(of)(*numbers), [False] * count)
     found, expected = jax.jit(lambda lanes: (plan(lanes, threads=1), jax.vmap(of)(*lanes)))(lanes)
     np.testing.assert_allclose(found, expected, rtol=1e-13, atol=1e-15)
 
@@ -174,8 +172,8 @@ def test_a_choice_is_that_of_numpy():
     def chosen(flag, single, double, first, second):
         pairs = (1.5, single), (double, 1), (first, second), (1.0, 2.0), (flag, False)
         return [
-            (where(choice, *pair), jnp.where(choice, *pair)) for pair in pairs for choice in (flag, ~flag, True)
-        ], where(jnp.arange(3) > 1, 1.0, jnp.arange(3.0))
+            (select(choice, *pair), jnp.where(choice, *pair)) for pair in pairs for choice in (flag, ~flag, True)
+        ], select(jnp.arange(3) > 1, 1.0, jnp.arange(3.0))
 
     given = np.True_, np.float32(2), np.float64(3), np.int32(1), np.int32(2)
     pairs, several = jax.jit(chosen)(*given)
@@ -183,7 +181,7 @@ def test_a_choice_is_that_of_numpy():
     for found, expected in pairs:
         assert (found.dtype, found.weak_type, found.item()) == (expected.dtype, expected.weak_type, expected.item())
     np.testing.assert_array_equal(several, [0, 1, 1])
-    alone = where(jnp.asarray(True), jnp.float64(3), 1)
+    alone = select(jnp.asarray(True), jnp.float64(3), 1)
     assert (alone.dtype, alone.weak_type, float(alone)) == (jnp.float64, False, 3.0)
 
 
@@ -191,12 +189,12 @@ def test_what_is_fixed_has_no_derivatives():
     """Check that a `fixed` value has no derivatives; all of it is one operation."""
 
     def of(x, y):
-        held = fixed({"a": x, "b": (y, jnp.int32(2))})
+        held = stop_gradient({"a": x, "b": (y, jnp.int32(2))})
         return x * held["a"] + held["b"][0]
 
     assert jax.grad(of, (0, 1))(3.0, 5.0) == (3.0, 0.0)
     np.testing.assert_array_equal(jax.vmap(jax.grad(of), (0, None))(jnp.arange(3.0), 2.0), [0, 1, 2])
-    assert str(jax.make_jaxpr(of)(3.0, 5.0)).count("fixed") == 1
+    assert str(jax.make_jaxpr(of)(3.0, 5.0)).count("stop_gradient_of_tree") == 1
 
 
 def squared_slope(value, by, change):
@@ -209,7 +207,7 @@ def test_given_values_in_a_scan(checkpoint):
 
     @checkpoint
     def step(x, _):
-        return given(squared_slope, jax.lax.stop_gradient(x**2), x), None
+        return custom_tangent(squared_slope, jax.lax.stop_gradient(x**2), x), None
 
     def of(x):
         return jax.lax.scan(step, x, None, length=3)[0]
@@ -221,7 +219,9 @@ def test_given_values_in_a_scan(checkpoint):
 
     @jax.jit
     def in_lanes(x):
-        scaled = jax.vmap(lambda a: given(squared_slope, jax.lax.stop_gradient(x[0] ** 2), a))  # the value is shared
+        scaled = jax.vmap(
+            lambda a: custom_tangent(squared_slope, jax.lax.stop_gradient(x[0] ** 2), a)
+        )  # the value is shared
         return jax.vmap(jax.hessian(of))(x), jax.hessian(lambda x: jax.vmap(of)(x).sum())(x), scaled(x)
 
     value, slope, seconds, third = alone(1.1)
@@ -266,9 +266,9 @@ def test_rules_are_functions_of_modules():
     def rule(value, by, change):
         return change
 
-    assert "squared_slope" in str(jax.make_jaxpr(lambda x: given(squared_slope, x, x))(1.0))
+    assert "squared_slope" in str(jax.make_jaxpr(lambda x: custom_tangent(squared_slope, x, x))(1.0))
     with pytest.raises(ValueError, match="must be a function of a module, but is .*rule"):
-        given(rule, 1.0, 1.0)
+        custom_tangent(rule, 1.0, 1.0)
     with pytest.raises(ValueError, match="must be a function of a module, but is .*lambda"):
         implicit(lambda by, x: x - by, 1.0, 1.0)
 
@@ -299,8 +299,8 @@ def operations_of(jaxpr):
 def recipes_in(jaxpr):
     """The recipes that a program asks for."""
     for equation in jaxpr.eqns:
-        if equation.primitive.name == "scenes":
-            yield equation.params["recipe"]
+        if equation.primitive.name == "lane_map":
+            yield equation.params["fn"]
         for value in equation.params.values():
             if hasattr(value, "jaxpr"):
                 yield from recipes_in(value.jaxpr)
@@ -315,15 +315,15 @@ def test_a_function_of_traced_numbers_keeps_its_kind_of_derivatives():
     """Check that a captured tracer becomes an argument, and that the kind of derivatives stays."""
 
     def of(a):
-        return differentiable(lambda x: a * x**2, derivatives="in a direction")(3.0)
+        return lane_function(lambda x: a * x**2, mode="jvp")(3.0)
 
-    assert recipe_in(jax.make_jaxpr(of)(2.0).jaxpr).derivatives == "in a direction"
+    assert recipe_in(jax.make_jaxpr(of)(2.0).jaxpr).mode == "jvp"
     assert jax.jvp(of, (2.0,), (1.0,))[1] == 9.0
 
 
 def test_a_few_at_once():
     """By more numbers there is no Jacobian, but the change in one direction."""
-    squares = differentiable(lambda x: x**2, derivatives="a few at once")
+    squares = lane_function(lambda x: x**2, mode="jacobian or jvp")
     for size, directions in ((64, 0), (65, 1)):
         x = np.arange(1.0, size + 1)
         asked = jax.make_jaxpr(lambda d, x=x: jax.jvp(squares, (x,), (d,))[1])(x)
@@ -338,10 +338,10 @@ def test_programs_are_small(motion, most):
     """Bound the operations that JAX traces, batches and differentiates of an outcome: a first answer waits for them."""
     asked = jax.make_jaxpr(lambda alpha: rk.outcome(rk.Block(alpha, 2.0), motion))(0.2)
     recipe = recipe_in(asked.jaxpr)
-    with marking(False):
+    with with_hints(False):
         assert 500 < operations_of(recipe.program.jaxpr).total() <= most
     for_xla = operations_of(recipe.program.jaxpr)
-    assert for_xla["keep"] and for_xla.total() <= 1.3 * most
+    assert for_xla["materialize"] and for_xla.total() <= 1.3 * most
 
 
 @pytest.mark.parametrize("motion", [rk.SinePulse(0.5, 1.0), rk.example_record()], ids=["pulse", "record"])
@@ -353,9 +353,9 @@ def test_programs_of_derivatives_of_histories_are_small(motion):
         return jnp.sum(history(jnp.linspace(0.0, 1.0, 8))[0] ** 2)
 
     asked = jax.make_jaxpr(jax.grad(misfit))(jnp.array([0.2, 2.0, 0.9, 1.1]))
-    with marking(False):
+    with with_hints(False):
         history = operations_of(recipe_in(asked.jaxpr).program.jaxpr)
-    assert history["scenes"] >= 2  # a step, the end
+    assert history["lane_map"] >= 2  # a step, the end
     assert (operations_of(asked.jaxpr) + history).total() <= 2500
 
 
@@ -364,9 +364,11 @@ def test_programs_of_slopes_by_all_samples_are_small():
     record = rk.example_record()
     margin = jax.grad(lambda samples: rk.outcome(rk.Block(0.2, 2.0), rk.Record(samples, record.dt)).margin)
     _, pulled_back = recipes_in(jax.make_jaxpr(margin)(record.samples).jaxpr)
-    with marking(False):
+    with with_hints(False):
         found = operations_of(pulled_back.program.jaxpr)
-    assert found["scenes"] + found["scene_alone"] == 4  # steps, once more where slopes are wanted; slopes; the end
+    assert (
+        found["lane_map"] + found["single_jacobian"] == 4
+    )  # steps, once more where slopes are wanted; slopes; the end
     assert found.total() <= 1300
 
 
@@ -415,7 +417,7 @@ def test_types_are_those_of_jax(first, second):
         assert dtype == jnp.result_type(one, other)
         if dtype.kind == "f":
             for value in (one, other):
-                ours, theirs = jax.typeof(typed(value, dtype)), jax.typeof(jnp.asarray(value, dtype))
+                ours, theirs = jax.typeof(as_dtype(value, dtype)), jax.typeof(jnp.asarray(value, dtype))
                 assert (ours.dtype, ours.shape, ours.weak_type) == (theirs.dtype, theirs.shape, theirs.weak_type)
         return x
 

@@ -22,7 +22,7 @@ import numpy as np
 import pytest
 
 import jaxrock as rk
-from jaxrock._aside import _reach_the_disk
+from jaxrock._core.atomic_files import _reach_the_disk
 from jaxrock.sweeps import devices, netcdf
 from jaxrock.sweeps.store import Store, local, opened
 from references import damage, kills, threads
@@ -476,14 +476,14 @@ def test_processes_and_threads_at_once_answer_as_one_alone():
 )
 def test_other_versions_do_not_go_on(store, monkeypatch, part, change):
     """Their last digits might differ. What is finished is read by any version that knows the format."""
-    name = "jaxrock.sweeps.description."
+    name = "jaxrock.sweeps.description.cache."
     monkeypatch.setattr(name + "version_of", lambda of: change.get(of, f"{of} 1.0"))
-    monkeypatch.setattr(name + "code", lambda: "some code")
+    monkeypatch.setattr(name + "code_digest", lambda: "some code")
     shutil.rmtree(store)
     run(store)
     monkeypatch.setattr(name + "version_of", lambda of: f"{of} 1.0")
     if not change:
-        monkeypatch.setattr(name + "code", lambda: "other code")
+        monkeypatch.setattr(name + "code_digest", lambda: "other code")
     with pytest.raises(ValueError, match=f"{store} was made by another sweep: other {part}. Take"):
         run(store)
     assert rk.studies.Grid.load(store).shape == (9, 50)

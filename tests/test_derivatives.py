@@ -11,14 +11,14 @@ import numpy as np
 import pytest
 
 import jaxrock as rk
-from jaxrock.engines.taylor.expansion import End, Start, arrive, expand
+from jaxrock.compiler import lane_function
+from jaxrock.engines.taylor.expansion import End, Start, arrive, taylor_expansion
 from jaxrock.engines.taylor.policy import POLICY
 from jaxrock.motions.record import roomy
 from jaxrock.motions.shaking import Shaking
 from jaxrock.numerics.polynomial import jet
 from jaxrock.responses.outcome import has_one_peak
 from jaxrock.studies.sensitivities import _told
-from jaxrock.transforms.differentiation import differentiable
 from references.in_jaxrock import MODELS, PULSES
 from references.smooth_differences import gradient
 
@@ -289,7 +289,7 @@ def test_a_tape_within_vmap():
 
     tree = np.linspace(0.1, 2.0, 70)
     scale = np.array([-1.0, 0.5, 1.0])
-    taped = differentiable(twice_where_positive, on_tape=on_tape)
+    taped = lane_function(twice_where_positive, reverse=on_tape)
     many = lambda function: lambda x: jax.vmap(lambda s: function(s * x))(scale)
     of_shared, plain = (np.asarray(jax.jit(jax.jacrev(many(f)))(tree)) for f in (taped, twice_where_positive))
     np.testing.assert_allclose(of_shared, plain, rtol=1e-13)
@@ -552,7 +552,7 @@ def test_a_step_against_its_own_series(model, vertical):
         return Start(table, q[1], jnp.ones(()), jnp.array(False), q[2], q[3], shaking, jnp.ones(()))
 
     def plainly(q):
-        return jnp.stack(jet(expand(start(q), order).opening, jnp.array(0.8), 1))
+        return jnp.stack(jet(taylor_expansion(start(q), order).opening, jnp.array(0.8), 1))
 
     def by_weights(q):
         opening, speed = jax.lax.stop_gradient(plainly(q))

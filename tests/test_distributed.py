@@ -51,7 +51,7 @@ import jaxrock as rk
 if count > 1:
     jax.distributed.initialize(f"127.0.0.1:{port}", count, own, initialization_timeout=100)
 rk.studies.use_cpu_devices(1 + own % 2)
-from jaxrock._checks import checked
+from jaxrock._arguments.ranges import checked
 from jaxrock.sweeps.store import Store
 """
     + SWEEPS

@@ -15,6 +15,7 @@ import pytest
 import jaxrock as rk
 
 ROOT = Path(__file__).parents[1]
+PACKAGE = Path(rk.__file__).parent
 has_machine_code = importlib.util.find_spec("llvmlite") is not None
 PAGES = sorted(path.relative_to(ROOT).as_posix() for path in [*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md")])
 # Recipes are tried by tests/test_log_density.py, many processes by tests/test_distributed.py, examples below.
@@ -93,6 +94,90 @@ def test_every_link_of_a_page_leads_somewhere(page):
         target = ((ROOT / page).parent / path).resolve() if path else ROOT / page
         assert target.exists(), link
         assert not anchor or anchor in anchors(target.read_text()), link
+
+
+MOST_WORDS = 90
+DEVELOPERS = [page for page in PAGES if page.startswith("docs/developer/")]
+ITEM = re.compile(r"\s*(?:[-*+]|\d+\.)\s")
+NAME_OF_A_MODULE = re.compile(r"`(?:jaxrock\.)?([a-z_]\w*(?:\.\w+)*)`")
+PATH_OF_A_FILE = re.compile(r"`([\w.]+(?:/[\w.]+)*/?)`")
+
+
+def paragraphs(text):
+    """Paragraphs and items of lists of a page; tables, headings and code are none."""
+    found = [""]
+    for line in re.sub(r"^```.*?^```", "", text, flags=re.DOTALL | re.MULTILINE).splitlines():
+        if not line.strip() or line.lstrip().startswith(("|", "#")):
+            found.append("")
+        elif ITEM.match(line):
+            found.append(line)
+        else:
+            found[-1] += f" {line}"
+    return [each for each in found if each.strip()]
+
+
+@pytest.mark.parametrize("page", [page for page in PAGES if page.startswith("docs/") or page == "CONTRIBUTING.md"])
+def test_paragraphs_are_short(page):
+    found = paragraphs((ROOT / page).read_text())
+    assert not [each for each in found if len(each.split()) > MOST_WORDS]
+
+
+def test_long_paragraphs_are_found():
+    """An item of a list counts by itself; a table and code do not count."""
+    many = "word " * MOST_WORDS
+    assert max(len(each.split()) for each in paragraphs(f"{many}\nword\n")) == MOST_WORDS + 1
+    short = f"{many}\n\n- {many[5:]}\n- word\n\n| {many} | {many} |\n\n```sh\n{many}\n\n{many}\n```\n"
+    assert max(len(each.split()) for each in paragraphs(short)) == MOST_WORDS
+
+
+def is_there(name):
+    """Return whether a module of the package, or an attribute of one, has this name."""
+    path, rest = PACKAGE, name.split(".")
+    while rest and ((path / rest[0]).is_dir() or (path / f"{rest[0]}.py").exists()):
+        path /= rest.pop(0)
+    module = ".".join(path.relative_to(PACKAGE.parent).parts)
+    if not rest or (module.startswith("jaxrock.compiler.llvm") and not has_machine_code):
+        return True
+    thing = importlib.import_module(module)
+    for part in rest:
+        if part in getattr(thing, "__annotations__", {}):  # a field without a default
+            return True
+        if not hasattr(thing, part):
+            return False
+        thing = getattr(thing, part)
+    return True
+
+
+def modules_named_in(text):
+    """Names in backticks or in diagrams that begin with a package of jaxrock, or with one of its modules."""
+    own = {path.stem for path in PACKAGE.iterdir()}
+    diagrams = re.findall(r"```text\n(.*?)```", text, re.DOTALL)
+    names = {*NAME_OF_A_MODULE.findall(text), *re.findall(r"[\w.]+", "\n".join(diagrams))}
+    return {name for name in names if "." in name and name.split(".")[0] in own}
+
+
+def files_named_in(text):
+    """Paths in backticks, of the repository, of the package, or of the tests by the name of a file alone."""
+    return {path for path in PATH_OF_A_FILE.findall(text) if "/" in path or re.fullmatch(r"test_\w+\.py", path)}
+
+
+@pytest.mark.skipif(not (ROOT / "notebooks").exists(), reason="needs the folder notebooks of the repository")
+@pytest.mark.parametrize("page", ["CONTRIBUTING.md", *DEVELOPERS])
+def test_modules_and_files_of_a_page_are_there(page):
+    text = (ROOT / page).read_text()
+    assert not [name for name in modules_named_in(text) if not is_there(name)]
+    places = ROOT, PACKAGE, ROOT / "tests"
+    assert not [path for path in files_named_in(text) if not any((place / path).exists() for place in places)]
+
+
+def test_modules_that_are_gone_are_found():
+    assert len(DEVELOPERS) > 10 and len(modules_named_in((ROOT / "docs/developer/compiler.md").read_text())) > 30
+    text = "`engines.gone`, `jaxrock.engines.rest`, `jax.jit`, `in_lanes`\n\n```text\n compiler.cache -> jax.jit\n```\n"
+    assert modules_named_in(text) == {"engines.gone", "engines.rest", "compiler.cache"}
+    for name in ("engines.rest", "engines.rest.wait", "engines.taylor.policy.POLICY.order", "compiler.lane_function"):
+        assert is_there(name), name
+    for name in ("engines.gone", "engines.rest.gone", "compiler.gone", "compiler.lane_function.gone"):
+        assert not is_there(name), name
 
 
 def namespaces():

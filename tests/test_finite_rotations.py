@@ -11,7 +11,7 @@ import pytest
 
 import jaxrock as rk
 from jaxrock.blocks.cantilever import unit_column
-from jaxrock.flexible.column import Column
+from jaxrock.flexible.column import ColumnConstants
 from jaxrock.flexible.nonlinear import NonlinearScene, scene_of
 from jaxrock.flexible.phases import rocking_phase
 from jaxrock.flexible.remainder import Tangents
@@ -138,7 +138,7 @@ def test_the_balance_is_a_saddle_of_the_energy(base):
 
     @jax.jit
     def found(block):
-        tangents = Tangents.of(Column.of(block))
+        tangents = Tangents.of(ColumnConstants.of(block))
         n, center = tangents.numbers.rotation.size, tangents.numbers.center
 
         def energy(x):

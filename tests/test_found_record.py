@@ -9,8 +9,8 @@ import pytest
 from scipy.optimize import minimize
 
 import jaxrock as rk
+from jaxrock.inverse.design_point import allowed_changes, least_change
 from jaxrock.inverse.kept_spectrum import KeptSpectrum
-from jaxrock.inverse.nearest_change import allowed_changes, least_change
 
 ALPHA, P, DT, COUNT = 0.2, 3.0, 0.02, 40
 LINEAR = {"model": rk.Linear(), "engine": rk.Series(order=12)}

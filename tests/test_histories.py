@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import jaxrock as rk
-from jaxrock.numerics.least_squares import Covariance, Minimum, Problem, Progression, covariance, least_squares
+from jaxrock.numerics.least_squares import Covariance, LeastSquares, Minimum, Progression, covariance, least_squares
 
 ALPHA, P, RESTITUTION, TILT = 0.2, 2.5, 0.9, 0.12
 TIME = np.linspace(0.02, 6.0, 240)
@@ -137,7 +137,7 @@ def test_certified_least_squares():
         return (point[0] * (1 - decay) - y) * inside, np.stack([1 - decay, point[0] * x * decay], axis=1)
 
     scale = np.array([500.0, 1e-4])
-    problem = Problem(at, scale, np.zeros(2), np.full(2, np.inf))
+    problem = LeastSquares(at, scale, np.zeros(2), np.full(2, np.inf))
     found = least_squares(problem, scale, Progression((14,), 0.1, 0.1), 3, 0)
     spread = covariance(found, scale, False)
     np.testing.assert_allclose(found.point, [2.3894212918e02, 5.5015643181e-04], rtol=1e-8)
@@ -152,7 +152,7 @@ def test_a_parameter_that_does_not_show_stays_and_has_no_interval():
     at = lambda point, samples: (point[0] - np.ones(20) + 0.1 * noise(1, 20), slopes)
     scale = np.ones(2)
     found = least_squares(
-        Problem(at, scale, -9 * scale, 9 * scale), np.array([3.0, 2.0]), Progression((20,), 0.1, 0.1), 1, 0
+        LeastSquares(at, scale, -9 * scale, 9 * scale), np.array([3.0, 2.0]), Progression((20,), 0.1, 0.1), 1, 0
     )
     assert found.point[1] == 2.0 and found.point[0] == pytest.approx(1 - 0.1 * noise(1, 20).mean())
     assert np.sqrt(covariance(found, scale, True).independent[1, 1]) > 1e5
@@ -182,7 +182,7 @@ def test_a_start_without_a_result_is_given_up():
         return np.where(point < 1.9, np.inf, (point - 3) * slope), slope[:, None]
 
     def found(first, starts):
-        problem = Problem(at, np.ones(1), -9 * np.ones(1), 9 * np.ones(1))
+        problem = LeastSquares(at, np.ones(1), -9 * np.ones(1), 9 * np.ones(1))
         return least_squares(problem, np.array([first]), Progression((9,), 1.0, 1e-6), starts, 0)
 
     nowhere = found(-5.0, 2)

@@ -15,8 +15,9 @@ import pytest
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 import jaxrock as rk
-from jaxrock import _foreign, _guard
-from jaxrock._foreign import CHECK
+from jaxrock.compiler import xla_ffi
+from jaxrock.compiler.primitive import error_if
+from jaxrock.compiler.xla_ffi import CHECK
 from jaxrock.engines.trajectory import Trajectory
 
 NAN, INF, HALF_PI = np.nan, np.inf, np.pi / 2
@@ -461,7 +462,7 @@ def test_checks_where_xla_has_no_function_for_them(monkeypatch):
     """Check that argument checks call back to Python where XLA has no function for them."""
     text = jax.jit(area).lower(0.2).as_text()
     assert CHECK in text and "callback" not in text
-    monkeypatch.setattr(_guard, "has_check", lambda: False)
+    monkeypatch.setattr(error_if, "has_check", lambda: False)
     compiled = jax.jit(lambda a: area(a) + 0.0)
     assert "callback" in compiled.lower(0.2).as_text()
     assert compiled(0.2) == area(0.2)
@@ -473,16 +474,16 @@ def test_checks_where_xla_has_no_function_for_them(monkeypatch):
 def test_what_failed_is_marked_where_no_error_can_be_made(failed):
     """Check that a failure is marked in the results if XLA returns no error when asked to make one."""
     flags = np.array([failed, not failed])
-    buffers = [_foreign.Buffer(data=flags[i:].ctypes.data) for i in range(2)]
+    buffers = [xla_ffi.Buffer(data=flags[i:].ctypes.data) for i in range(2)]
     tables = [(ctypes.c_void_p * 1)(ctypes.addressof(each)) for each in buffers]
-    args, rets = (_foreign.Buffers(size=1, buffers=ctypes.addressof(table)) for table in tables)
+    args, rets = (xla_ffi.Buffers(size=1, buffers=ctypes.addressof(table)) for table in tables)
     message = b"a message"
-    text = _foreign._Text(ctypes.cast(message, ctypes.c_void_p), len(message))
+    text = xla_ffi._Text(ctypes.cast(message, ctypes.c_void_p), len(message))
     texts = (ctypes.c_void_p * 1)(ctypes.addressof(text))
-    interface = _foreign.Interface(create_error=_foreign._Complain(lambda complaint: 0))
-    frame = _foreign.Frame(api=ctypes.addressof(interface), stage=_foreign.EXECUTE, args=args, rets=rets)
+    interface = xla_ffi.Interface(create_error=xla_ffi._Complain(lambda complaint: 0))
+    frame = xla_ffi.Frame(api=ctypes.addressof(interface), stage=xla_ffi.EXECUTE, args=args, rets=rets)
     frame.attributes.values = ctypes.addressof(texts)
-    assert not _foreign._check(ctypes.addressof(frame)) and flags[1] == failed
+    assert not xla_ffi._check(ctypes.addressof(frame)) and flags[1] == failed
 
 
 rotation_at = jax.jit(lambda response, time: response(time)[0])

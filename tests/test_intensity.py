@@ -12,7 +12,7 @@ from scipy.linalg import expm
 
 import jaxrock as rk
 from jaxrock.motions.measures import measure_of, strengths
-from jaxrock.motions.straight import straight
+from jaxrock.motions.piecewise_linear import piecewise_linear
 
 G, A, T = 9.81, 0.3, 0.8
 SINE = rk.SinePulse(A, T)
@@ -427,7 +427,7 @@ def test_a_pulse_among_many_pieces(case):
     speed = amplitude * 9.81 * period / np.pi
     np.testing.assert_allclose(rk.intensity.peak_acceleration(motion), amplitude, rtol=1e-12)
     np.testing.assert_allclose(rk.intensity.peak_velocity(motion), speed, rtol=1e-9)
-    np.testing.assert_allclose(np.abs(straight(motion).velocity).max(), speed, rtol=1e-6)
+    np.testing.assert_allclose(np.abs(piecewise_linear(motion).velocity).max(), speed, rtol=1e-6)
     block = rk.Block(0.25, 2.0)
     np.testing.assert_allclose(rk.intensity.uplift_ratio(motion, block), amplitude / np.tan(0.25), rtol=1e-12)
 

@@ -19,7 +19,7 @@ from jaxrock.inverse.posterior import _within
 from jaxrock.inverse.profile_likelihood import shape_at
 from jaxrock.inverse.scatter import Possible, Quadrature, levels_around, rocks_at
 from jaxrock.inverse.unknowns import Evaluator, Problem, _batch
-from jaxrock.numerics.climb import climb
+from jaxrock.numerics.batched_bfgs import batched_bfgs
 
 # All tests have twelve rocks and a sine pulse, so that they share one compiled program.
 ALPHA = np.array([0.10, 0.12, 0.14, 0.16, 0.18, 0.20, 0.22, 0.24, 0.26, 0.28, 0.31, 0.34])
@@ -371,8 +371,8 @@ def test_climbers_find_summits_and_hold_what_is_held():
         return value, -2 * (x - 1) * np.array([1.0, 40.0])
 
     starts = np.array([[0.0, 0.0], [3.0, -2.0]])
-    np.testing.assert_allclose(climb(hills, starts).points[0], 1.0, atol=1e-4)
-    held = climb(hills, starts, np.array([True, False]), group=np.arange(len(starts)))
+    np.testing.assert_allclose(batched_bfgs(hills, starts).points[0], 1.0, atol=1e-4)
+    held = batched_bfgs(hills, starts, np.array([True, False]), group=np.arange(len(starts)))
     np.testing.assert_allclose(held.points, [[1.0, 0.0], [1.0, -2.0]], atol=1e-4)
 
     def single(x):
@@ -380,7 +380,7 @@ def test_climbers_find_summits_and_hold_what_is_held():
         value, slope = hills(x)
         return np.where(x[:, 0] > 2, np.nan, value).astype(np.float32), slope.astype(np.float32)
 
-    found = climb(single, starts)
+    found = batched_bfgs(single, starts)
     np.testing.assert_allclose(found.points[0], 1.0, atol=1e-3)
     np.testing.assert_array_equal(found.arrived, [True, False])
 

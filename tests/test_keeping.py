@@ -16,12 +16,11 @@ import numpy as np
 import pytest
 
 import jaxrock as rk
-from jaxrock import _quickly
-from jaxrock._arguments import path_of
-from jaxrock._quickly import MUCH, options, quickly
+from jaxrock._arguments.annotations import path_of
 from jaxrock.command_line.main import main
+from jaxrock.compiler.cache import changes, key, store
+from jaxrock.compiler.hints import LOW_EFFORT_LIMIT, jit_low_effort, low_effort, low_effort_options
 from jaxrock.engines import scene
-from jaxrock.keeping import changes, facts, folder
 from jaxrock.sweeps import runner
 from jaxrock.sweeps.store import local
 
@@ -32,22 +31,22 @@ QUICK = {"model": rk.Linear(), "engine": rk.Series(order=4)}
 @pytest.fixture
 def place(tmp_path, monkeypatch):
     monkeypatch.setenv("JAXROCK_CACHE", str(tmp_path / "kept"))
-    return folder.folder()
+    return store.folder()
 
 
 def test_the_folder_may_be_that_of_a_user(monkeypatch, tmp_path):
     monkeypatch.setenv("HOME", str(tmp_path))
     monkeypatch.setenv("JAXROCK_CACHE", "~/kept")
-    assert folder.folder().parent == tmp_path / "kept"
+    assert store.folder().parent == tmp_path / "kept"
     assert path_of("path", "~/record.AT2") == tmp_path / "record.AT2"
     assert local("store", "~/outcomes.zarr") == tmp_path / "outcomes.zarr"
 
 
 def test_what_is_written_is_read(place):
-    assert folder.read("machine", NAME) is None
-    folder.write("machine", NAME, b"content")
-    assert folder.read("machine", NAME) == b"content"
-    assert folder.kept() == [place / "machine" / NAME]
+    assert store.read("machine", NAME) is None
+    store.write("machine", NAME, b"content")
+    assert store.read("machine", NAME) == b"content"
+    assert store.files() == [place / "machine" / NAME]
 
 
 def test_known_numbers_are_not_compiled(caplog):
@@ -62,35 +61,35 @@ def test_known_numbers_are_not_compiled(caplog):
 
 @pytest.mark.parametrize("damage", ["a flipped bit", "cut short", "empty", "longer"])
 def test_what_is_damaged_is_not_read(place, damage):
-    folder.write("machine", NAME, b"content" * 100)
+    store.write("machine", NAME, b"content" * 100)
     path = place / "machine" / NAME
     content = bytearray(path.read_bytes())
     if damage == "a flipped bit":
         content[200] ^= 1
     path.write_bytes({"cut short": content[:-1], "empty": b"", "longer": content + b"x"}.get(damage, content))
-    assert folder.read("machine", NAME) is None
+    assert store.read("machine", NAME) is None
     assert not path.exists()  # so that it is made again
 
 
 def test_the_oldest_goes_first(place):
     names = [f"jaxrock_{i:020}" for i in range(5)]
     for i, name in enumerate(names):
-        folder.write("machine", name, bytes(1000))
+        store.write("machine", name, bytes(1000))
         os.utime(place / "machine" / name, (i, i))
-    folder.read("machine", names[0])  # used now
-    (place / folder.OF_JAX).mkdir()
-    (place / folder.OF_JAX / f"jit_its_own-{64 * '0'}-cache").write_bytes(bytes(5000))
+    store.read("machine", names[0])  # used now
+    (place / store.OF_JAX).mkdir()
+    (place / store.OF_JAX / f"jit_its_own-{64 * '0'}-cache").write_bytes(bytes(5000))
     (place.parent / "of the user").write_bytes(bytes(5000))
-    folder.prune(3 * 1045)
-    kept = [path.name for path in folder.kept() if path.parent.name == "machine"]
-    assert sorted(kept) == [names[0], *names[3:]] and len(folder.kept()) == 4
+    store.prune(3 * 1045)
+    kept = [path.name for path in store.files() if path.parent.name == "machine"]
+    assert sorted(kept) == [names[0], *names[3:]] and len(store.files()) == 4
     assert (place.parent / "of the user").exists()
 
 
 def test_nothing_fails_where_nothing_can_be_kept(place):
     place.parent.write_text("a file is in the way")
-    folder.write("machine", NAME, b"content")
-    assert folder.read("machine", NAME) is None
+    store.write("machine", NAME, b"content")
+    assert store.read("machine", NAME) is None
     assert float(jax.jit(lambda a: rk.outcome(rk.Block(0.2, 2.0), rk.SinePulse(a, 0.8), **QUICK).margin)(0.3)) > 0
 
 
@@ -99,24 +98,24 @@ def test_many_write_at_once(place):
 
     def work(content):
         for _ in range(20):
-            folder.write("machine", NAME, content)
-            assert folder.read("machine", NAME) in contents
+            store.write("machine", NAME, content)
+            assert store.read("machine", NAME) in contents
 
     threads = [threading.Thread(target=work, args=(content,)) for content in contents]
     for thread in threads:
         thread.start()
     for thread in threads:
         thread.join()
-    assert folder.read("machine", NAME) in contents
+    assert store.read("machine", NAME) in contents
 
 
 def test_facts_of_a_question():
     """Check the facts of a question: equal if only numbers differ, others for another kind, setting, shape or type."""
     block, pulse = rk.Block(0.2, 2.0), rk.SinePulse(0.3, 0.8)
-    known = facts.facts((block, pulse, rk.Series()))
+    known = key.key_of((block, pulse, rk.Series()))
     assert known is not None
-    assert known == facts.facts((rk.Block(0.3, 1.0), rk.SinePulse(0.1, 2.0), rk.Series()))
-    assert known == facts.facts(jax.eval_shape(lambda: (block, pulse, rk.Series())))
+    assert known == key.key_of((rk.Block(0.3, 1.0), rk.SinePulse(0.1, 2.0), rk.Series()))
+    assert known == key.key_of(jax.eval_shape(lambda: (block, pulse, rk.Series())))
     record = rk.example_record()
     others = [
         (rk.Block(0.2, 2.0, rk.restitution.AngularMomentum()), pulse, rk.Series()),
@@ -130,10 +129,10 @@ def test_facts_of_a_question():
         (block, 2.0 * record, rk.Series()),
         (block, rk.Record(np.float32(record.samples), np.float32(0.01)), rk.Series()),
     ]
-    told = [facts.facts(each) for each in others]
+    told = [key.key_of(each) for each in others]
     assert None not in told and len({known, *told}) == len(others) + 1
     renamed = rk.Record(record.samples, record.dt, name="another")
-    assert facts.facts((block, renamed, rk.Series())) == told[6]
+    assert key.key_of((block, renamed, rk.Series())) == told[6]
 
 
 def test_what_is_a_users_own_has_no_facts():
@@ -142,7 +141,7 @@ def test_what_is_a_users_own_has_no_facts():
 
     equation = rk.models.Equation(lambda x, b: jnp.sin(b.alpha - x), lambda x, b: jnp.cos(b.alpha - x))
     for own in (Mine(0.3, 0.8), equation, lambda x: x, [1.0, object()]):
-        assert facts.facts(own) is None
+        assert key.key_of(own) is None
 
 
 # Of what compiles quickly, in all ways. Who asks little keeps a program of a user's own, too, with checks.
@@ -151,7 +150,7 @@ _ANSWER = """
 import os, pathlib, sys, jax, jax.monitoring
 jax.config.update("jax_enable_x64", True)
 import jax.numpy as jnp, numpy as np, jaxrock as rk
-from jaxrock.transforms.recipe import Recipe
+from jaxrock.compiler.primitive.lane_function import LaneFunction
 kept = pathlib.Path(os.environ["JAXROCK_CACHE"])
 questions, copy = sys.argv[1].split(), os.fork()
 questions = questions[copy > 0]
@@ -165,8 +164,8 @@ if questions == "few":  # after the other, and after all that was kept is damage
 if questions != "all":
     rk.keep_compiled()
 traced = []
-trace = Recipe._trace
-Recipe._trace = lambda *given: traced.append(1) or trace(*given)
+trace = LaneFunction._trace
+LaneFunction._trace = lambda *given: traced.append(1) or trace(*given)
 given = dict(model=rk.Linear(), engine=rk.Series(order=4))
 def peak(x): return rk.outcome(rk.Block(x[0], 2.0), rk.SinePulse(x[1], 0.8), **given).max_rotation
 x = np.array([0.2, 0.3]) * np.linspace(0.98, 1.02, 70)[:, None]
@@ -191,7 +190,7 @@ if questions != "all":
     except Exception as error:
         print(error)
 print(end="\\0", flush=True)
-""".replace("OF_JAX", folder.OF_JAX)
+""".replace("OF_JAX", store.OF_JAX)
 
 
 def sessions_of(place, questions):
@@ -235,7 +234,7 @@ def sessions(tmp_path_factory):
     start = time.time()
     beside, first = sessions_of(place, "one all")
     seconds = time.time() - start
-    kept = {path.parent.name for path in place.rglob("*") if path.is_file() and folder.OF_JAX not in path.parts}
+    kept = {path.parent.name for path in place.rglob("*") if path.is_file() and store.OF_JAX not in path.parts}
     later, damaged = sessions_of(place, "all few")
     return Sessions(first, beside, later, damaged, kept, seconds)
 
@@ -274,24 +273,24 @@ def test_another_version_of_the_package_asks_anew(place, monkeypatch):
 
     first, once = ask(), exports()
     assert ask() == first and exports() == once > 0
-    monkeypatch.setattr(facts, "versions", lambda: "another")
+    monkeypatch.setattr(key, "versions", lambda: "another")
     assert ask() == first and exports() == 2 * once
 
 
 def test_settings_are_told_by_their_values():
     """Numbers of NumPy, too: they are no leaves."""
     settings = [np.int64(3), np.int64(4), np.int32(4), 4, np.float32(1e-3), np.float32(1e-9), np.arange(3), np.ones(3)]
-    told = {facts.facts((rk.Series(), setting)) for setting in settings}
+    told = {key.key_of((rk.Series(), setting)) for setting in settings}
     assert None not in told and len(told) == len(settings)
 
 
 def test_code_that_changed_since_it_was_imported_is_not_kept(monkeypatch):
     def asked():
-        facts._on_disk.cache_clear()
-        return facts.versions()
+        key._on_disk.cache_clear()
+        return key.versions()
 
     known = asked()
-    monkeypatch.setattr(facts, "_AT_IMPORT", facts._AT_IMPORT[1:])
+    monkeypatch.setattr(key, "_AT_IMPORT", key._AT_IMPORT[1:])
     assert len({known, asked(), asked()}) == 3
     monkeypatch.undo()
     assert asked() == known
@@ -307,20 +306,20 @@ def test_a_package_without_its_text_is_told_by_what_there_is(tmp_path):
             root.touch()
         else:
             (root / "package" / kept).touch()
-        assert [path for path, *_ in facts._files(root / "package")] == [root / "package" / kept if kept else root]
+        assert [path for path, *_ in key._files(root / "package")] == [root / "package" / kept if kept else root]
 
 
 def test_a_file_under_the_name_of_another_is_not_read(place):
     for name in (NAME, OTHER):
-        folder.write("machine", name, name.encode())
+        store.write("machine", name, name.encode())
     os.replace(place / "machine" / NAME, place / "machine" / OTHER)
-    assert folder.read("machine", OTHER) is None
+    assert store.read("machine", OTHER) is None
 
 
 @pytest.mark.parametrize("said", ["off", "OFF", " off ", "0", "no", "False"])
 def test_nothing_is_kept_where_the_environment_says_so(monkeypatch, said):
     monkeypatch.setenv("JAXROCK_CACHE", said)
-    assert folder.folder() is None
+    assert store.folder() is None
 
 
 def test_what_is_imported_meanwhile():
@@ -369,7 +368,7 @@ def test_what_is_patched_asks_anew_and_is_kept_for_nobody_else(place, monkeypatc
                 rk.RickerPulse.series, "__code__", rk.RickerPulse.series.__code__.replace(co_firstlineno=1)
             )
 
-    genuine, known = rk.SinePulse.series, facts.versions()
+    genuine, known = rk.SinePulse.series, key.versions()
     for first in ("patched", "as it is"):
         monkeypatch.setenv("JAXROCK_CACHE", str(place / first))
         answers = {}
@@ -377,7 +376,7 @@ def test_what_is_patched_asks_anew_and_is_kept_for_nobody_else(place, monkeypatc
             with monkeypatch.context() as patched:
                 if now == "patched":
                     patch(patched)
-                assert (facts.versions() == known) == (now == "as it is")
+                assert (key.versions() == known) == (now == "as it is")
                 found = ask()
                 assert answers.setdefault(now, found) == found
         assert (answers["patched"] != answers["as it is"]) == (kind == "a class")
@@ -387,20 +386,20 @@ def test_a_folder_that_vanishes(place, monkeypatch):
     def gone(largest):
         raise FileNotFoundError
 
-    monkeypatch.setattr(folder, "prune", gone)
-    folder.write("machine", NAME, b"content")
-    assert folder.read("machine", NAME) == b"content"
+    monkeypatch.setattr(store, "prune", gone)
+    store.write("machine", NAME, b"content")
+    assert store.read("machine", NAME) == b"content"
 
 
 def test_what_cannot_be_deleted_is_said(place, capsys):
-    folder.write("machine", NAME, b"content")
-    assert main(["cache", "--clear"]) == 0 and not folder.kept()
+    store.write("machine", NAME, b"content")
+    assert main(["cache", "--clear"]) == 0 and not store.files()
     assert "1 compiled programs" in capsys.readouterr().out
-    folder.write("machine", NAME, b"content")
+    store.write("machine", NAME, b"content")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(folder, "remove", lambda path: None)  # as in a folder that cannot be written
+        patch.setattr(store, "remove", lambda path: None)  # as in a folder that cannot be written
         assert main(["cache", "--clear"]) == 2
-    assert "1 of 1 files" in capsys.readouterr().err and folder.kept()
+    assert "1 of 1 files" in capsys.readouterr().err and store.files()
 
 
 def test_programs_of_a_moment():
@@ -408,7 +407,7 @@ def test_programs_of_a_moment():
     those, whatever transforms them."""
     traces = []
 
-    @quickly(static_argnames="power")
+    @jit_low_effort(static_argnames="power")
     def total(numbers, power):
         traces.append(power)
         return jnp.sum(numbers**power)
@@ -421,7 +420,7 @@ def test_programs_of_a_moment():
     np.testing.assert_array_equal(jax.vmap(lambda x: x * total(known, power=2))(known), 5 * known)
     np.testing.assert_array_equal(jax.grad(lambda x: total(x, power=2))(known), 2 * known)
     np.testing.assert_array_equal(jax.jit(jax.vmap(lambda x: total(x * known, power=2)))(known), 5 * known**2)
-    assert float(total(jnp.ones(MUCH + 1), power=3)) == MUCH + 1
+    assert float(total(jnp.ones(LOW_EFFORT_LIMIT + 1), power=3)) == LOW_EFFORT_LIMIT + 1
     assert total(jax.device_put(known, jax.devices()[-1]), power=2).devices() == {jax.devices()[-1]}
     with jax.disable_jit():
         assert float(total(known, power=2)) == 5.0
@@ -429,8 +428,10 @@ def test_programs_of_a_moment():
 
 def test_options_of_programs_of_a_moment():
     """Check options of quickly compiled programs: LLVM's effort always, XLA's emitters while a choice exists."""
-    assert {"xla_backend_optimization_level": 0} == {k: v for k, v in options().items() if "emitters" not in k}
-    assert ("xla_cpu_use_fusion_emitters" in options()) or jaxlib.version.__version_info__[:2] > (0, 10)
+    assert {"xla_backend_optimization_level": 0} == {
+        k: v for k, v in low_effort_options().items() if "emitters" not in k
+    }
+    assert ("xla_cpu_use_fusion_emitters" in low_effort_options()) or jaxlib.version.__version_info__[:2] > (0, 10)
 
 
 def test_scenes_that_xla_runs_are_compiled_well(monkeypatch):
@@ -447,9 +448,9 @@ def test_scenes_that_xla_runs_are_compiled_well(monkeypatch):
 
         return compiled
 
-    total = quickly(jit, follows_scenes=True)(jnp.sum)
+    total = jit_low_effort(jit, follows_scenes=True)(jnp.sum)
     for has in (True, False, True):
-        monkeypatch.setattr(_quickly, "_has_machine_code", lambda has=has: has)
+        monkeypatch.setattr(low_effort, "_has_machine_code", lambda has=has: has)
         assert float(total(jnp.arange(3.0))) == 3.0
     assert ways == ["quickly", "well", "quickly"]
 
@@ -457,7 +458,7 @@ def test_scenes_that_xla_runs_are_compiled_well(monkeypatch):
 def test_sweeps_are_compiled_as_what_is_in_them_wants(monkeypatch):
     """Check that the content of sweeps chooses their compilation.
 
-    Programs without loops and light functions of few points take the least time; all others use XLA's best.
+    Programs without loops and cheap functions of few points take the least time; all others use XLA's best.
     """
     ways = []
     compiled = jax.stages.Lowered.compile
@@ -472,7 +473,7 @@ def test_sweeps_are_compiled_as_what_is_in_them_wants(monkeypatch):
     def halved(x):
         return jax.lax.while_loop(lambda x: x > 1, lambda x: x / 2, x)
 
-    options()  # asks this jaxlib once
+    low_effort_options()  # asks this jaxlib once
     monkeypatch.setattr(jax.stages.Lowered, "compile", compile_)
     x = np.arange(5.0)
     with jax.default_device(jax.devices()[-1]):
@@ -480,12 +481,12 @@ def test_sweeps_are_compiled_as_what_is_in_them_wants(monkeypatch):
             for _ in range(2):
                 np.testing.assert_array_equal(rk.sweep(function, x=x, progress=False).values, expected)
         assert ways == ["quickly", "well"]
-        of_one_block = runner.light(lambda x, _: halved(x))
+        of_one_block = runner.cheap_per_point(lambda x, _: halved(x))
         for scene, points in (((), 5), (np.zeros(500_000), 5), ((), 2**14 + 1)):
             (found,) = runner.Runner(of_one_block, (x,), scene, 5, points)([x])
             np.testing.assert_array_equal(found, [0, 1, 1, 0.75, 1])
-        assert ways[2:] == ["quickly", "well", "well"]  # where they are light, few, and of a short motion
-        monkeypatch.setattr(runner, "MUCH", 4)
+        assert ways[2:] == ["quickly", "well", "well"]  # where they are cheap, few, and of a short motion
+        monkeypatch.setattr(runner, "LOW_EFFORT_LIMIT", 4)
         for block in (None, 2):  # of few points, of many in all
             np.testing.assert_array_equal(rk.sweep(straight, x=x, block=block, progress=False).values, 2 * x)
     assert len(ways) == 5  # of many points, and on many devices, with the options of `jax.jit`

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import jaxrock as rk
-from jaxrock.motions.pieces import Lasting
+from jaxrock.motions.pieces import Extent
 from jaxrock.responses.outcome import _outcome
 
 QUICK = {"model": rk.Linear(), "engine": rk.Series(order=6)}  # compiles in half the time
@@ -68,7 +68,7 @@ def test_how_many_pieces_last_without_looking_at_each(kind, most=400):
 
     def both(dt, finish):
         listed = jnp.where(dt * jnp.arange(most) < finish, dt, 0.0)
-        return Lasting.of_equal(dt, most, finish), Lasting.of(listed)
+        return Extent.of_equal(dt, most, finish), Extent.of(listed)
 
     found, expected = jax.vmap(both)(dt, finish)
     np.testing.assert_array_equal(found.forward, dt >= 0)

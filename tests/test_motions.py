@@ -12,7 +12,7 @@ import pytest
 
 import jaxrock as rk
 from jaxrock.inverse.likelihood import _of_strength
-from jaxrock.motions.pieces import Lasting
+from jaxrock.motions.pieces import Extent
 from jaxrock.motions.pulses.pulse import AbstractPulse
 from jaxrock.motions.record import padded, with_room
 
@@ -562,7 +562,7 @@ def test_sums_of_many_motions_are_small_programs():
 
     def operations(count):
         motion = functools.reduce(operator.add, [rk.SinePulse(0.2, 1.0 + k).shifted(0.1 * k) for k in range(count)])
-        return len(jax.make_jaxpr(lambda motion: (motion.scales, motion.lateness))(motion).eqns)
+        return len(jax.make_jaxpr(lambda motion: (motion.scales, motion.time_rounding))(motion).eqns)
 
     assert operations(8) < 4.5 * operations(4)  # squares, for the knots of sums within sums
 
@@ -572,7 +572,7 @@ def test_how_many_pieces_last(name):
     """As the lengths tell it: of the motion, with room for more samples, after quiet, and after none."""
     for motion in (MOTIONS[name], padded(MOTIONS[name]), with_room(2.0 * MOTIONS[name])):
         for whole in (motion, motion.shifted(0.3), motion.shifted(0.0)):
-            found, expected = whole.lasting, Lasting.of(whole.lengths)
+            found, expected = whole.lasting, Extent.of(whole.lengths)
             assert (int(found.pieces), bool(found.forward)) == (int(expected.pieces), bool(expected.forward))
 
 

@@ -14,8 +14,8 @@ import jaxlib
 import numpy as np
 import pytest
 
-native = pytest.importorskip("jaxrock.native.call", reason="needs llvmlite")
-machine = pytest.importorskip("jaxrock.native.machine", reason="needs llvmlite")
+native = pytest.importorskip("jaxrock.compiler.llvm.compiled_program", reason="needs llvmlite")
+jit = pytest.importorskip("jaxrock.compiler.llvm.jit", reason="needs llvmlite")
 
 import diffrax  # noqa: E402
 import equinox as eqx  # noqa: E402
@@ -23,17 +23,18 @@ import equinox.internal as eqxi  # noqa: E402
 from llvmlite import binding, ir  # noqa: E402
 
 import jaxrock as rk  # noqa: E402
-from jaxrock import _foreign  # noqa: E402
-from jaxrock._programs import programs_of  # noqa: E402
 from jaxrock.closed_form import single_lobe  # noqa: E402
-from jaxrock.native import kernels, plain as plain_programs  # noqa: E402
-from jaxrock.native.builder import Builder  # noqa: E402
-from jaxrock.native.fused import fused  # noqa: E402
-from jaxrock.native.lists import Memory, _one_of_two  # noqa: E402
-from jaxrock.native.operations import Unsupported  # noqa: E402
-from jaxrock.numerics.apart import apart  # noqa: E402
-from jaxrock.transforms import batching, recipe  # noqa: E402
-from jaxrock.transforms.differentiation import differentiable, with_derivatives_of  # noqa: E402
+from jaxrock.compiler import lane_function, xla_ffi  # noqa: E402
+from jaxrock.compiler.hints import divergent  # noqa: E402
+from jaxrock.compiler.jaxpr.form_fma import form_fma  # noqa: E402
+from jaxrock.compiler.jaxpr.inline_and_fold import inline_and_fold  # noqa: E402
+from jaxrock.compiler.jaxpr.traverse import programs_of  # noqa: E402
+from jaxrock.compiler.llvm import kernels  # noqa: E402
+from jaxrock.compiler.llvm.builder import Builder  # noqa: E402
+from jaxrock.compiler.llvm.memory_arrays import Memory, _one_of_two  # noqa: E402
+from jaxrock.compiler.llvm.operations import Unsupported  # noqa: E402
+from jaxrock.compiler.primitive import lane_function as lane_functions, lanes as lane_programs  # noqa: E402
+from jaxrock.numerics.derivatives_of import with_derivatives_of  # noqa: E402
 
 NUMBERS = np.array([0.0, -0.0, 1.0, -1.5, 2.5, 3.5, 1e-300, 1e300, -7.3, np.inf, -np.inf, np.nan, 0.1])
 OTHERS = np.roll(NUMBERS, 5)
@@ -43,7 +44,7 @@ WHOLE = np.array([0, 1, -1, 7, -7, 100, 2**31 - 1, -(2**31), 5, 6, 8, 9, 10], np
 def planned(function, leaves, shared, refilled=False, count=None, threads=1, lanes=None):
     """`function(leaves)` of many lanes, in machine code, to be called with such leaves."""
     like = [jax.ShapeDtypeStruct(x.shape if same else x.shape[1:], x.dtype) for x, same in zip(leaves, shared)]
-    plan = native.Plan(jax.make_jaxpr(function)(like), shared, refilled, lanes=lanes)
+    plan = native.CompiledProgram(jax.make_jaxpr(function)(like), shared, refilled, lanes=lanes)
     return jax.jit(lambda *leaves: plan(list(leaves), threads, count))
 
 
@@ -101,7 +102,7 @@ def test_what_all_share_is_computed_once_in_a_lane(caplog, monkeypatch):
     with caplog.at_level(logging.DEBUG, "jaxrock"):
         left = run(of_shared, [alpha, a, values], [True, False, True])
     np.testing.assert_allclose(left, own, rtol=1e-15)
-    assert "what all scenes share is left to XLA: nothing" in caplog.text
+    assert "what all lanes share is left to XLA: nothing" in caplog.text
 
 
 def test_lists_in_order():
@@ -132,10 +133,10 @@ def test_products_that_are_added_to_something(name):
     function, count = FUSED[name]
     values = np.random.default_rng(4).normal(size=(3, 20))
     values[:, -8:] = np.array(list(itertools.product([0.0, -0.0], repeat=3))).T
-    program = fused(jax.make_jaxpr(lambda *v: [function(*v)])(*values[:, 0]))
+    program = form_fma(jax.make_jaxpr(lambda *v: [function(*v)])(*values[:, 0]))
 
     def number_of(jaxpr):
-        here = sum(equation.primitive.name == "compound_multiply_add" for equation in jaxpr.eqns)
+        here = sum(equation.primitive.name == "macro_multiply_add" for equation in jaxpr.eqns)
         return here + sum(map(number_of, (inner for equation in jaxpr.eqns for inner in programs_of(equation))))
 
     assert number_of(program.jaxpr) == count
@@ -396,9 +397,9 @@ def steps_apart(leaves):
             return i + 1, (number + 1) % 1009, few, fewer + number
 
         def other():
-            return jax.lax.cond(apart(number % 2 == 0), rare, rarer)
+            return jax.lax.cond(divergent(number % 2 == 0), rare, rarer)
 
-        return jax.lax.cond(apart(number % 7 > 0), frequent, other)
+        return jax.lax.cond(divergent(number % 7 > 0), frequent, other)
 
     return jax.lax.while_loop(lambda s: s[0] < turns, step, (jnp.int32(0), number, jnp.int32(0), jnp.int32(0)))
 
@@ -469,22 +470,22 @@ def test_threads_share_lanes(threads, refilled):
 def test_functions_of_xla_are_where_its_header_has_them():
     header = Path(jaxlib.__file__).parent / "include" / "xla" / "ffi" / "api" / "c_api.h"
     order = re.findall(r"^ *_XLA_FFI_API_STRUCT_FIELD\(XLA_FFI_(\w+)\);", header.read_text(), re.MULTILINE)
-    first, size = _foreign.Interface.create_error.offset, ctypes.sizeof(ctypes.c_void_p)
+    first, size = xla_ffi.Interface.create_error.offset, ctypes.sizeof(ctypes.c_void_p)
     fields = {"create_error": "Error_Create", "destroy_error": "Error_Destroy", "schedule": "ThreadPool_Schedule"}
     for own, name in fields.items():
-        assert getattr(_foreign.Interface, own).offset == first + size * order.index(name)
+        assert getattr(xla_ffi.Interface, own).offset == first + size * order.index(name)
 
 
 @pytest.mark.parametrize("taken", [0, 1])
 def test_errors_of_a_pool_without_threads_are_given_back(taken):
     """XLA answers with an error where it takes no task, which is then ours; this thread does what is left."""
-    (name,) = native.Plan(jax.make_jaxpr(lambda x: [x * x])(1.0), [False]).names
+    (name,) = native.CompiledProgram(jax.make_jaxpr(lambda x: [x * x])(1.0), [False]).names
     function = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.c_void_p)
-    handler, error, asked, freed = function(machine._machine()._engine.get_function_address(name)), 4096, [], []
+    handler, error, asked, freed = function(jit._machine()._engine.get_function_address(name)), 4096, [], []
 
     @function
     def schedule(address):
-        task = _foreign.Task.from_address(address)
+        task = xla_ffi.Task.from_address(address)
         asked.append(task.struct_size)
         if len(asked) > taken:
             return error
@@ -492,20 +493,20 @@ def test_errors_of_a_pool_without_threads_are_given_back(taken):
 
     @function
     def destroy(address):
-        done = _foreign.Done.from_address(address)
+        done = xla_ffi.Done.from_address(address)
         freed.append((done.struct_size, done.extension_start, done.error))
 
     def buffers(*arrays):
-        each = [_foreign.Buffer(0, None, 0, x.ctypes.data) for x in arrays]
+        each = [xla_ffi.Buffer(0, None, 0, x.ctypes.data) for x in arrays]
         table = (ctypes.c_void_p * len(each))(*map(ctypes.addressof, each))
         held.extend([each, table])
-        return _foreign.Buffers(size=len(each), buffers=ctypes.addressof(table))
+        return xla_ffi.Buffers(size=len(each), buffers=ctypes.addressof(table))
 
     held, x, found = [], np.arange(1024.0), np.zeros(1024)
-    interface = _foreign.Interface(
+    interface = xla_ffi.Interface(
         destroy_error=ctypes.cast(destroy, ctypes.c_void_p), schedule=ctypes.cast(schedule, ctypes.c_void_p)
     )
-    frame = _foreign.Frame(api=ctypes.addressof(interface), stage=_foreign.EXECUTE, rets=buffers(found))
+    frame = xla_ffi.Frame(api=ctypes.addressof(interface), stage=xla_ffi.EXECUTE, rets=buffers(found))
     frame.args = buffers(np.array([x.size, x.size, 4], np.int32), x)
     assert handler(ctypes.addressof(frame)) is None
     assert len(asked) == taken + 1 and freed == [(24, None, error)]
@@ -772,7 +773,7 @@ def test_programs_in_plain_operations(name):
     """Check that constant folding and the unrolling of loops with a known number of turns change no number."""
     function, left = PROGRAMS[name]
     x = np.linspace(-1, 4, 9)
-    program = plain_programs.plain(jax.make_jaxpr(jax.jit(function))(1.0))
+    program = inline_and_fold(jax.make_jaxpr(jax.jit(function))(1.0))
     kept = names_in(program.jaxpr) & {"while", "scan", "cond", "jit", "select_n", "dynamic_slice", "unvmap_any"}
     assert kept == left
     expected = jax.jit(jax.vmap(function))(x)
@@ -785,7 +786,7 @@ def test_what_nobody_needs_is_left_out():
         spare = jax.lax.while_loop(lambda y: y < 9, lambda y: y * 2, x)
         return [with_derivatives_of(jnp.sin(x), spare)]
 
-    assert names_in(plain_programs.plain(jax.make_jaxpr(function)(1.0)).jaxpr) == {"sin"}
+    assert names_in(inline_and_fold(jax.make_jaxpr(function)(1.0)).jaxpr) == {"sin"}
 
 
 def test_what_calls_back_is_left_to_xla():
@@ -827,7 +828,7 @@ def test_programs_have_names_of_their_own():
     program, other = (jax.make_jaxpr(lambda x, factor=factor: [jnp.exp(x) * factor])(1.0) for factor in (3, 4))
 
     def name(program, shared, lanes=8):
-        return machine.registered(program, [shared], kernels.emit, lanes, 3)
+        return jit.registered(program, [shared], kernels.emit, lanes, 3)
 
     assert name(program, False) == name(program, False)
     assert len({name(program, False), name(program, True), name(other, False), name(program, False, lanes=2)}) == 4
@@ -967,7 +968,7 @@ def test_a_scene_has_one_answer(name, monkeypatch):
     """Alone, within `jit`, among few others that share a number with it or do not, and among many that are taken a few
     at a time: the same to the bit, with LLVM's efforts as users have them."""
     with_effort(3, monkeypatch)
-    monkeypatch.setitem(machine.EFFORT, "in a moment", 0)
+    monkeypatch.setitem(jit.EFFORT, "in a moment", 0)
     scene, u = SCENES.get(name, all_of_it), np.concatenate([np.linspace(0.2, 0.3, 40), np.linspace(0.3, 0.9, 10)])
     found = [[scene(0.2, x) for x in u], [jax.jit(scene)(0.2, x) for x in u]]
     found = [jax.tree.map(lambda *each: np.stack(each), *each) for each in found]
@@ -981,10 +982,10 @@ def test_a_scene_has_one_answer(name, monkeypatch):
 
 def with_effort(effort: int, monkeypatch):
     """Compile machine code anew, with so much of it."""
-    for kind in machine.EFFORT:
-        monkeypatch.setitem(machine.EFFORT, kind, effort)
-    for each in list(recipe._alike.values()):
-        each.plans.clear()
+    for kind in jit.EFFORT:
+        monkeypatch.setitem(jit.EFFORT, kind, effort)
+    for each in list(lane_functions._alike.values()):
+        each.compiled.clear()
 
 
 def test_closed_forms_at_any_effort(monkeypatch):
@@ -1025,7 +1026,7 @@ def test_diffrax_as_xla_has_it(name, monkeypatch):
     a, u = jnp.linspace(0.1, 0.3, 20), jnp.linspace(1.3, 0.2, 20)
     found = jax.vmap(SCENES[name])(a, u)
     jax.clear_caches()
-    monkeypatch.setattr(batching, "native", None)
+    monkeypatch.setattr(lane_programs, "native", None)
     for one, other in zip(jax.tree.leaves(found), jax.tree.leaves(jax.vmap(SCENES[name])(a, u)), strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-7)
 
@@ -1048,7 +1049,7 @@ def test_what_a_loop_does_not_change_comes_before_it(name, monkeypatch, caplog):
         return jax.jit(lambda a, u: jax.vmap(SCENES[name])(a, u)).lower(*given)
 
     own = lowered()
-    monkeypatch.setattr(batching, "native", None)
+    monkeypatch.setattr(lane_programs, "native", None)
     with caplog.at_level(logging.DEBUG, "jaxrock"):
         by_xla = lowered()
     assert "is left to XLA: there is no llvmlite" in caplog.text
@@ -1087,8 +1088,8 @@ def test_arrays_that_are_constants_of_a_refilled_loop():
 
 
 def test_an_interface_that_is_not_known_is_left_to_xla(monkeypatch, caplog):
-    monkeypatch.setattr(machine, "is_known", lambda: False)
-    twice = differentiable(lambda x: 2 * x, in_lanes=True)
+    monkeypatch.setattr(jit, "is_known", lambda: False)
+    twice = lane_function(lambda x: 2 * x, in_lanes=True)
     with caplog.at_level(logging.DEBUG, "jaxrock"):
         np.testing.assert_array_equal(jax.vmap(twice)(jnp.arange(5.0)), 2 * np.arange(5.0))
     assert "left to XLA: XLA's interface of this version" in caplog.text

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import jaxrock as rk
-from jaxrock._parameters import in_real_numbers
+from jaxrock._arguments.parameters import in_real_numbers
 from jaxrock.studies.parameters import named, rebuilt
 
 FIRM, SPEED = 0.9, 5.0

@@ -12,8 +12,8 @@ import jax
 import pytest
 
 from jaxrock.command_line.main import main
-from jaxrock.keeping import compiled, folder, ownership
-from jaxrock.keeping.compiled import keep_compiled
+from jaxrock.compiler.cache import enable, ownership, store
+from jaxrock.compiler.cache.enable import keep_compiled
 
 NAME, OTHER = "jaxrock_" + 20 * "a", 40 * "b"
 OF_JAX = f"jit_f-{64 * 'c'}-cache"
@@ -28,9 +28,9 @@ def place(tmp_path, monkeypatch):
     ownership.warn_once.cache_clear()
     (tmp_path / "of the user").mkdir()
     monkeypatch.setenv("JAXROCK_CACHE", str(tmp_path / "of the user"))
-    folder.write("machine", NAME, b"content")
-    assert folder.read("machine", NAME) == b"content"
-    return folder.folder()
+    store.write("machine", NAME, b"content")
+    assert store.read("machine", NAME) == b"content"
+    return store.folder()
 
 
 @pytest.fixture
@@ -62,9 +62,9 @@ def mode(path):
 def refused(message):
     """Check that nothing is read or written, and that one warning says why."""
     with pytest.warns(RuntimeWarning, match=message) as said:
-        assert folder.read("machine", NAME) is None
-        folder.write("machine", OTHER, b"content")
-        assert folder.read("machine", OTHER) is None
+        assert store.read("machine", NAME) is None
+        store.write("machine", OTHER, b"content")
+        assert store.read("machine", OTHER) is None
     assert len(said) == 1 and "Let JAXROCK_CACHE name a folder of yours" in str(said[0].message)
     return True
 
@@ -74,10 +74,10 @@ def test_new_folders_and_files_are_private(tmp_path, monkeypatch, umask):
     monkeypatch.setenv("JAXROCK_CACHE", str(tmp_path / "new" / "kept"))
     before = os.umask(umask)
     try:
-        folder.write("machine", NAME, b"content")
+        store.write("machine", NAME, b"content")
     finally:
         os.umask(before)
-    place = folder.folder()
+    place = store.folder()
     assert [mode(each) for each in (place.parent.parent, place.parent, place, place / "machine")] == 4 * [0o700]
     assert mode(place / "machine" / NAME) == 0o600
 
@@ -86,7 +86,7 @@ def test_new_folders_and_files_are_private(tmp_path, monkeypatch, umask):
 def test_a_folder_of_the_users_is_closed_to_others(place, loose):
     for each in (place, place / "machine"):
         each.chmod(loose)
-    assert folder.read("machine", NAME) == b"content"
+    assert store.read("machine", NAME) == b"content"
     assert mode(place) == mode(place / "machine") == 0o700
 
 
@@ -99,20 +99,20 @@ def test_a_folder_of_another_user_is_not_used(place, give_away, which):
 def test_a_file_of_another_user_is_not_read(place, give_away):
     """The file is neither replaced nor removed, and another can be cached beside it."""
     give_away(place / "machine" / NAME)
-    assert folder.read("machine", NAME) is None
-    folder.write("machine", NAME, b"another")
-    assert folder.read("machine", NAME) is None and (place / "machine" / NAME).read_bytes().endswith(b"content")
-    folder.write("machine", OTHER, b"content")
-    assert folder.read("machine", OTHER) == b"content"
+    assert store.read("machine", NAME) is None
+    store.write("machine", NAME, b"another")
+    assert store.read("machine", NAME) is None and (place / "machine" / NAME).read_bytes().endswith(b"content")
+    store.write("machine", OTHER, b"content")
+    assert store.read("machine", OTHER) == b"content"
 
 
 @pytest.mark.parametrize("loose", [0o620, 0o602, 0o666])
 def test_a_file_that_others_could_write_is_made_anew(place, loose):
     path = place / "machine" / NAME
     path.chmod(loose)
-    assert folder.read("machine", NAME) is None and not path.exists()
-    folder.write("machine", NAME, b"anew")
-    assert folder.read("machine", NAME) == b"anew"
+    assert store.read("machine", NAME) is None and not path.exists()
+    store.write("machine", NAME, b"anew")
+    assert store.read("machine", NAME) == b"anew"
 
 
 def test_a_file_that_is_a_link_is_not_read(place, tmp_path):
@@ -122,9 +122,9 @@ def test_a_file_that_is_a_link_is_not_read(place, tmp_path):
     path.symlink_to(tmp_path / "elsewhere")
     os.mkfifo(place / "machine" / OTHER)
     for name in (NAME, OTHER):
-        assert folder.read("machine", name) is None
-        folder.write("machine", name, b"content")
-        assert folder.read("machine", name) is None
+        assert store.read("machine", name) is None
+        store.write("machine", name, b"content")
+        assert store.read("machine", name) is None
     assert path.is_symlink() and (tmp_path / "elsewhere").exists()
 
 
@@ -132,7 +132,7 @@ def test_a_file_that_is_a_link_is_not_read(place, tmp_path):
 def test_a_parent_writable_by_others(place, bits, good):
     """Others could rename the folder, and put another in its place, except in a sticky folder such as /tmp."""
     place.parent.chmod(bits)
-    assert folder.read("machine", NAME) == b"content" if good else refused("others may write in .*of the user")
+    assert store.read("machine", NAME) == b"content" if good else refused("others may write in .*of the user")
 
 
 @pytest.mark.parametrize(
@@ -164,14 +164,14 @@ def test_a_parent_that_a_group_may_write(place, monkeypatch, members, name, user
     monkeypatch.setattr(pwd, "getpwall", lambda: known)
     monkeypatch.setattr(grp, "getgrgid", lambda _: SimpleNamespace(gr_mem=members, gr_name=name))
     place.parent.chmod(0o775)
-    assert folder.read("machine", NAME) == b"content" if good else refused("others may write in .*of the user")
+    assert store.read("machine", NAME) == b"content" if good else refused("others may write in .*of the user")
 
 
 def test_nothing_is_kept_in_what_is_no_folder(monkeypatch):
     """There is nothing to warn of, although all users may write in it."""
     monkeypatch.setenv("JAXROCK_CACHE", os.devnull)
-    folder.write("machine", NAME, b"content")
-    assert folder.read("machine", NAME) is None
+    store.write("machine", NAME, b"content")
+    assert store.read("machine", NAME) is None
 
 
 def test_a_parent_of_another_user(place, give_away):
@@ -183,7 +183,7 @@ def test_owners_that_a_container_does_not_know(place, give_away, monkeypatch):
     """In a user namespace the parents may seem to belong to `nobody`; the folder itself may not."""
     monkeypatch.setattr(ownership, "_is_mapped", lambda: True)
     give_away(place.parent)
-    assert folder.read("machine", NAME) == b"content"
+    assert store.read("machine", NAME) == b"content"
     give_away(place)
     assert refused("belongs to another user")
 
@@ -214,8 +214,8 @@ def test_a_link_to_a_larger_disk(place, tmp_path, give_away, whose, linked):
         assert refused("on the way to them, belongs to another user")
         assert not list((tmp_path / "disk").iterdir())
         return
-    folder.write("machine", NAME, b"content")
-    assert folder.read("machine", NAME) == b"content"
+    store.write("machine", NAME, b"content")
+    assert store.read("machine", NAME) == b"content"
     assert [path.name for path in (tmp_path / "disk").iterdir()] == ["jaxrock-compiled"]
 
 
@@ -252,36 +252,36 @@ def test_only_what_the_package_made_is_removed(place, tmp_path, capsys, linked):
         file.write_text("years of work")
         os.utime(file, (1e9, 1e9))
     with (home / "results.h5").open("ab") as file:
-        file.truncate(2 * folder.LARGEST)  # a sparse file
+        file.truncate(2 * store.LARGEST)  # a sparse file
     elsewhere = tmp_path / "elsewhere"
     elsewhere.write_text("years of work")
-    folder.write("machine", NAME, b"content")
-    (folder.folder() / "machine" / ("jaxrock_" + 20 * "d")).symlink_to(elsewhere)
-    folder.prune(0)
-    assert not folder.kept()
-    folder.write("machine", NAME, b"content")
+    store.write("machine", NAME, b"content")
+    (store.folder() / "machine" / ("jaxrock_" + 20 * "d")).symlink_to(elsewhere)
+    store.prune(0)
+    assert not store.files()
+    store.write("machine", NAME, b"content")
     assert main(["cache", "--clear"]) == 0 and "1 compiled programs" in capsys.readouterr().out
     for name in USERS:
         with (home / name).open() as file:
             assert file.read(13) == "years of work"
-    assert elsewhere.exists() and not folder.kept()
+    assert elsewhere.exists() and not store.files()
 
 
 def test_what_was_never_finished_goes_after_a_while(place):
     for age, name in ((0, NAME), (1000, OTHER)):
         unfinished = place / "machine" / f".{name}.{32 * '0'}.partial"
-        unfinished.write_bytes(folder._MARK + b"half")
+        unfinished.write_bytes(store._MARK + b"half")
         when = unfinished.stat().st_mtime - age
         os.utime(unfinished, (when, when))
-    folder.prune(folder.LARGEST)
-    assert {path.name for path in folder.kept()} == {NAME, f".{NAME}.{32 * '0'}.partial"}
+    store.prune(store.LARGEST)
+    assert {path.name for path in store.files()} == {NAME, f".{NAME}.{32 * '0'}.partial"}
 
 
 def test_files_without_a_mark_are_known_by_their_digest(place):
     path = place / "machine" / NAME
-    path.write_bytes(path.read_bytes().removeprefix(folder._MARK))
-    assert folder.read("machine", NAME) == b"content" and folder.kept() == [path]
-    folder.clear()
+    path.write_bytes(path.read_bytes().removeprefix(store._MARK))
+    assert store.read("machine", NAME) == b"content" and store.files() == [path]
+    store.clear()
     assert not path.exists()
 
 
@@ -289,18 +289,18 @@ def test_files_without_a_mark_are_known_by_their_digest(place):
 def unset(monkeypatch):
     """Leave JAX without a cache, and return the settings that the package makes."""
     told = {}
-    monkeypatch.setattr(compiled, "setting", lambda _: None)
-    monkeypatch.setattr(compiled, "compile_quickly", lambda: None)
+    monkeypatch.setattr(enable, "setting", lambda _: None)
+    monkeypatch.setattr(enable, "compile_quickly", lambda: None)
     monkeypatch.setattr(jax.config, "update", told.__setitem__)
     return told
 
 
 def test_jax_keeps_its_programs_in_a_private_folder(place, unset):
     """JAX's own folder lies beside those of other releases of JAX."""
-    (place / folder.OF_JAX).mkdir()
-    (place / folder.OF_JAX / "of another release").touch()
+    (place / store.OF_JAX).mkdir()
+    (place / store.OF_JAX / "of another release").touch()
     keep_compiled()
-    assert unset["jax_compilation_cache_dir"] == str(place / folder.OF_JAX) and mode(place / folder.OF_JAX) == 0o700
+    assert unset["jax_compilation_cache_dir"] == str(place / store.OF_JAX) and mode(place / store.OF_JAX) == 0o700
 
 
 @pytest.mark.parametrize(
@@ -308,7 +308,7 @@ def test_jax_keeps_its_programs_in_a_private_folder(place, unset):
 )
 def test_jax_runs_nothing_of_others(place, unset, tmp_path, give_away, planted):
     """JAX reads any file in its folder, follows links, and deletes files that have its names."""
-    there = place / folder.OF_JAX
+    there = place / store.OF_JAX
     if planted == "its folder is a link":
         there.symlink_to(tmp_path)
     else:
@@ -324,7 +324,7 @@ def test_jax_runs_nothing_of_others(place, unset, tmp_path, give_away, planted):
 
 @pytest.mark.parametrize("loose, left", [(0o755, True), (0o775, False), (0o777, False)])
 def test_files_of_jax_that_others_could_write_are_removed(place, unset, loose, left):
-    there = place / folder.OF_JAX
+    there = place / store.OF_JAX
     there.mkdir()
     (there / OF_JAX).touch()
     there.chmod(loose)
@@ -336,14 +336,14 @@ def test_names_of_jax_are_those_that_it_gives(tmp_path):
     """Names follow the installed release of JAX, which leaves no other files."""
     code = """
 import jax, os, sys, jaxrock as rk
-from jaxrock.keeping import folder
+from jaxrock.compiler.cache import store
 rk.keep_compiled()
 jax.jit(lambda x: 2 * x)(1.0)
-made, others = folder.of_jax()
+made, others = store.of_jax()
 assert made and not others, others
-assert set(folder.kept()) == {path for path in folder.folder().rglob("*") if path.is_file()}
-folder.clear()
-assert not list(folder.folder().iterdir())
+assert set(store.files()) == {path for path in store.folder().rglob("*") if path.is_file()}
+store.clear()
+assert not list(store.folder().iterdir())
 """
     environment = os.environ | {"JAXROCK_CACHE": str(tmp_path / "kept"), "JAX_PLATFORMS": "cpu"}
     done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True)

@@ -7,7 +7,7 @@ import scipy.signal
 
 import jaxrock as rk
 from jaxrock.motions.filters import evenly, of_displacement, of_velocity, smoothed
-from jaxrock.motions.straight import straight
+from jaxrock.motions.piecewise_linear import piecewise_linear
 
 G, DT = 9.81, 0.01
 TIME = DT * np.arange(1001)
@@ -20,20 +20,20 @@ do = rk.processing
 def test_a_record_comes_back_from_its_displacement(first):
     """The spline of the displacement is what straight lines of acceleration integrate to, from rest, with a jolt."""
     samples = np.asarray(SMOOTH.samples) + first * np.exp(-TIME)
-    lines = straight(rk.Record(samples, DT))
+    lines = piecewise_linear(rk.Record(samples, DT))
     found = do.from_displacement(100 * lines.displacement, DT, unit="cm")
     np.testing.assert_allclose(found.samples[:-20], samples[:-20], atol=1e-8)
-    np.testing.assert_allclose(straight(found).displacement, lines.displacement, atol=1e-12)
+    np.testing.assert_allclose(piecewise_linear(found).displacement, lines.displacement, atol=1e-12)
 
 
 def test_a_record_comes_back_from_its_velocity():
-    found = do.from_velocity(straight(SMOOTH).velocity, DT)
+    found = do.from_velocity(piecewise_linear(SMOOTH).velocity, DT)
     np.testing.assert_allclose(found.samples, SMOOTH.samples, atol=2e-4)
-    np.testing.assert_allclose(straight(found).velocity, straight(SMOOTH).velocity, atol=2e-4)
+    np.testing.assert_allclose(piecewise_linear(found).velocity, piecewise_linear(SMOOTH).velocity, atol=2e-4)
 
 
 def test_noise_of_a_displacement_needs_the_filter():
-    place = straight(SMOOTH).displacement + np.random.default_rng(1).normal(0, 1e-5, TIME.size)
+    place = piecewise_linear(SMOOTH).displacement + np.random.default_rng(1).normal(0, 1e-5, TIME.size)
     raw, smooth = (do.from_displacement(place, DT, corner=corner) for corner in (None, 8.0))
     assert np.abs(raw.samples - SMOOTH.samples).max() > 0.02
     assert np.abs(smooth.samples - SMOOTH.samples).max() < 2e-3

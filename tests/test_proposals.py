@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from jaxrock.numerics.proposals import Kernels, around, begin, learn
+from jaxrock.numerics.independence_sampler import Kernels, around, begin, learn
 
 BOX = np.array([-10.0, -10.0]), np.array([10.0, 10.0])
 

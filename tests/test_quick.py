@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 
 import jaxrock as rk
+from jaxrock.compiler import lane_function
 from jaxrock.numerics.elementary import logarithm
-from jaxrock.numerics.lookup import pick
+from jaxrock.numerics.lookup import take
 from jaxrock.numerics.polynomial import root_of
 from jaxrock.responses.arguments import start_of
-from jaxrock.responses.outcome import _passes, outcome_like
-from jaxrock.transforms.differentiation import differentiable
+from jaxrock.responses.outcome import _OutcomePasses, outcome_like
 from references.edge_cases import GROUPS, kept_cases, solver
 
 PULSES = {
@@ -176,7 +176,7 @@ def test_gliding_blocks_are_as_few(case):
 def test_few_scenes_are_postponed(model, kind):
     """Otherwise the quick pass would be right, and slow."""
     model = MODELS[model]
-    passes = _passes(False)
+    passes = _OutcomePasses(rounds=False)
 
     def like(scene):
         return outcome_like(scene), jax.ShapeDtypeStruct((), bool)
@@ -185,7 +185,7 @@ def test_few_scenes_are_postponed(model, kind):
         block = rk.Block(alpha, p, restitution)
         pulse = rk.SinePulse(intensity * model.moments(block).threshold, 2 * jnp.pi / (ratio * p))
         scene = block, pulse, model, start_of((0.0, 0.0)), rk.Series()
-        return differentiable(passes.at_once, name="at once", results=like, in_lanes=True)(scene)[1]
+        return lane_function(passes.fast_only, key="at once", results=like, in_lanes=True)(scene)[1]
 
     with jax.enable_x64(kind == "double"):
         postponed = jax.jit(jax.vmap(one))(*map(jnp.asarray, scenes(2000)))
@@ -209,7 +209,7 @@ def test_logarithm():
 def test_pick(count):
     values, index = np.arange(10.0, 10.0 + count), np.arange(-1, count + 3)
     expected = values[np.clip(index, 0, count - 1)]
-    picked = jax.jit(jax.vmap(lambda i: pick(jnp.asarray(values), jnp.maximum(i, 0))))(index)
+    picked = jax.jit(jax.vmap(lambda i: take(jnp.asarray(values), jnp.maximum(i, 0))))(index)
     np.testing.assert_array_equal(picked, expected)
 
 

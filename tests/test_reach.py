@@ -11,7 +11,7 @@ import pytest
 import jaxrock as rk
 from jaxrock.engines.scene import Scene
 from jaxrock.engines.state import initial_state
-from jaxrock.engines.taylor import reach
+from jaxrock.engines.taylor import trial_step
 
 RNG = np.random.default_rng(11)
 SAMPLES = RNG.normal(0, 0.3, 40)
@@ -64,11 +64,11 @@ def test_exact_pieces_are_those_of_the_series(dt):
     """Half and quarters of pieces, too, where p dt is large."""
     where = RNG.bit_generator.state
     given = drawn()
-    exact, speeds = reached(reach._exactly, *given, dt)
+    exact, speeds = reached(trial_step._exactly, *given, dt)
     assert np.all(exact.holds) and (np.all(exact.full) or dt > 0.04)
     RNG.bit_generator.state = where
     given = drawn()
-    series, _ = reached(reach._by_series, *given, dt)
+    series, _ = reached(trial_step._by_series, *given, dt)
     same = np.asarray(exact.room == series.room)
     assert same.mean() > 0.1
     for name in ("opening", "speed"):
@@ -80,7 +80,7 @@ def test_exact_pieces_are_those_of_the_series(dt):
 @pytest.mark.parametrize("dt", [0.005, 0.15])
 def test_what_is_told_of_a_piece_is_so(dt):
     """Check the facts of a piece: one-way velocity keeps its sign, steady velocity grows or falls, and bounds hold."""
-    exact, speeds = reached(reach._exactly, *drawn(), dt)
+    exact, speeds = reached(trial_step._exactly, *drawn(), dt)
     speeds = np.asarray(speeds)
     signs = np.sign(speeds)
     assert np.all((signs == signs[:, :1]).all(axis=1)[np.asarray(exact.one_way)])
@@ -105,7 +105,7 @@ def test_only_linear_equations_under_straight_lines_go_exactly():
         scene = Scene.of(rk.Block(0.2, 2.0), motion, model)
         stepper = rk.Series().stepper(scene, None, history=False)
         state = initial_state(scene, jnp.asarray(0.1), jnp.asarray(0.0))
-        found.append(reach._is_linear(stepper.start(state, *stepper.shaking(state.piece, state.local))))
+        found.append(trial_step._is_linear(stepper.start(state, *stepper.shaking(state.piece, state.local))))
         return state
 
     assert is_exact(rk.Linear(), record) and is_exact(rk.Linear(), 2 * record)

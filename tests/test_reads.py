@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 import jaxrock as rk
-from jaxrock._checks import throwing
-from jaxrock.transforms.fingerprint import Traced
-from jaxrock.transforms.reads import reads
-from jaxrock.transforms.user_function import current_function
+from jaxrock._core.throwing import throwing
+from jaxrock.compiler import trace_function
+from jaxrock.compiler.cache.dependency_key import dependency_key
+from jaxrock.compiler.jaxpr.traced_function import TracedFunction
 
 BLOCK, RECORD = rk.Block(0.2, 2.0, 0.9), rk.Record([0.1, 0.2], 0.1)
 SIZE, ARRAY, PAIR = 2.0, jnp.ones(2), (1, (2.0, "b"))
@@ -113,13 +113,13 @@ NOT_TOLD = {
 
 @pytest.mark.parametrize("name", TOLD)
 def test_told(name):
-    assert reads(TOLD[name]) == reads(TOLD[name]) is not None
-    assert hash(reads(TOLD[name])) == hash(reads(TOLD[name]))
+    assert dependency_key(TOLD[name]) == dependency_key(TOLD[name]) is not None
+    assert hash(dependency_key(TOLD[name])) == hash(dependency_key(TOLD[name]))
 
 
 @pytest.mark.parametrize("name", NOT_TOLD)
 def test_not_told(name):
-    assert reads(NOT_TOLD[name]) is None
+    assert dependency_key(NOT_TOLD[name]) is None
 
 
 def test_which_function_is_called_again_is_told():
@@ -135,7 +135,7 @@ def test_which_function_is_called_again_is_told():
         return 10 * x
 
     orders = [(same, tenfold, same), (same, tenfold, tenfold), (same, same, tenfold)]
-    assert len({reads(held(*order)) for order in orders}) == 3
+    assert len({dependency_key(held(*order)) for order in orders}) == 3
     for order in orders:
         assert float(rk.sweep(held(*order), x=[2.0]).values[0]) == held(*order)(2.0)
 
@@ -158,22 +158,22 @@ def test_not_told_where_it_imports_or_assigns():
         count += 1
         return x
 
-    assert reads(importing) is reads(assigning) is reads(counting) is None
+    assert dependency_key(importing) is dependency_key(assigning) is dependency_key(counting) is None
 
 
 def test_what_is_traced_is_not_told():
-    jax.jit(lambda size: reads(lambda x: size * x) is None or pytest.fail())(1.0)
+    jax.jit(lambda size: dependency_key(lambda x: size * x) is None or pytest.fail())(1.0)
 
 
 @pytest.mark.parametrize("name", ["a block, a record", "functions within", "defaults"])
 def test_traced_once(name):
-    assert Traced.of(TOLD[name], POINT) is Traced.of(TOLD[name], POINT)
+    assert TracedFunction.of(TOLD[name], **POINT) is TracedFunction.of(TOLD[name], **POINT)
 
 
 def test_functions_of_models_are_traced_once():
     number = POINT["x"]
-    assert current_function(helper, number) is current_function(helper, number)
-    assert current_function(reading_lists, number) is not current_function(reading_lists, number)
+    assert trace_function(helper, number) is trace_function(helper, number)
+    assert trace_function(reading_lists, number) is not trace_function(reading_lists, number)
 
 
 def test_traced_again_under_other_settings():
@@ -181,11 +181,11 @@ def test_traced_again_under_other_settings():
         return x * jnp.ones(1)
 
     single = {"x": jax.ShapeDtypeStruct((), np.dtype("float32"))}
-    double = Traced.of(function, POINT)
+    double = TracedFunction.of(function, **POINT)
     with jax.enable_x64(False):
-        assert Traced.of(function, single).shapes.dtype == np.float32
-    assert Traced.of(function, POINT) is double and double.shapes.dtype == np.float64
-    assert Traced.of(function, single).shapes.dtype == np.float64  # of the array
+        assert TracedFunction.of(function, **single).results.dtype == np.float32
+    assert TracedFunction.of(function, **POINT) is double and double.results.dtype == np.float64
+    assert TracedFunction.of(function, **single).results.dtype == np.float64  # of the array
 
 
 def test_traced_again_where_nothing_is_raised():
@@ -194,11 +194,11 @@ def test_traced_again_where_nothing_is_raised():
     def function(x):
         return rk.Block(x, 1.0).alpha
 
-    raising = Traced.of(function, POINT)
+    raising = TracedFunction.of(function, **POINT)
     with throwing(False):
-        marking = Traced.of(function, POINT)
-    assert raising is Traced.of(function, POINT) and raising.program.messages and not marking.program.messages
-    assert np.isnan(jax.tree.leaves(marking(-1.0, marking.constants))[0])
+        marking = TracedFunction.of(function, **POINT)
+    assert raising is TracedFunction.of(function, **POINT) and raising.program.messages and not marking.program.messages
+    assert np.isnan(jax.tree.leaves(marking(x=-1.0))[0])
 
 
 @pytest.mark.parametrize(
@@ -209,11 +209,11 @@ def test_what_changes_is_seen(name, change, monkeypatch):
     def function(x):
         return helper(x * ARRAY * BLOCK.alpha)
 
-    before = reads(function)
+    before = dependency_key(function)
     monkeypatch.setitem(globals(), name, change)
-    assert before is not None and reads(function) not in (before, None)
+    assert before is not None and dependency_key(function) not in (before, None)
     monkeypatch.undo()
-    assert reads(function) == before
+    assert dependency_key(function) == before
 
 
 def test_code_that_changes_is_seen():
@@ -222,14 +222,14 @@ def test_code_that_changes_is_seen():
     def function(x):
         return x
 
-    before = reads(function)
+    before = dependency_key(function)
     function.__code__ = (lambda x: 2 * x).__code__
-    assert reads(function) not in (before, None)
+    assert dependency_key(function) not in (before, None)
 
 
 def test_signs_of_zero_and_kinds_of_numbers_are_told_apart():
     def of(size):
-        return reads(lambda x: x / size)
+        return dependency_key(lambda x: x / size)
 
     told = [of(size) for size in (0.0, -0.0, 0, False, 0.0 + 0.0j)]
     assert len(set(told)) == len(told) and None not in told

@@ -8,8 +8,8 @@ from scipy.interpolate import CubicHermiteSpline
 from scipy.optimize import minimize
 
 import jaxrock as rk
+from jaxrock.motions.piecewise_linear import piecewise_linear
 from jaxrock.motions.pulse_fit import _models, _Problem
-from jaxrock.motions.straight import straight
 
 DT = 0.01
 TIME = DT * np.arange(2001)
@@ -18,7 +18,7 @@ GROUND = rk.Record(
     + 0.03 * np.sin(2 * np.pi * 0.15 * TIME) * np.exp(-(((TIME - 10) / 3) ** 2)),
     DT,
 )
-PLACE = straight(GROUND).displacement
+PLACE = piecewise_linear(GROUND).displacement
 NOISE = np.random.default_rng(8)
 
 # ------------------------------------------------------------------------------------------------ fused
@@ -35,7 +35,7 @@ def test_what_both_sensors_agree_on_stays(step):
 def test_what_both_agree_on_stays_at_both_ends(begin, end):
     """Also where the ground moves at once, and when the sensors are switched off."""
     part = rk.Record(GROUND.samples[begin:end], DT)
-    found = rk.processing.fused(part, straight(part).displacement, DT, corner=0.5)
+    found = rk.processing.fused(part, piecewise_linear(part).displacement, DT, corner=0.5)
     np.testing.assert_allclose(found.samples, part.samples, atol=1e-5)
 
 
@@ -44,7 +44,7 @@ def test_two_bad_sensors_make_a_good_one():
     drifting = rk.Record(GROUND.samples + 0.003 * np.cos(0.2 * TIME) + 0.002, DT)
     noisy = PLACE + NOISE.normal(0, 1e-3, TIME.size)
     found = rk.processing.fused(drifting, 100 * noisy, DT, unit="cm", corner=0.3)
-    wrong = [np.abs(straight(each).displacement - PLACE).max() for each in (drifting, found)]
+    wrong = [np.abs(piecewise_linear(each).displacement - PLACE).max() for each in (drifting, found)]
     assert wrong[0] > 2.0 and wrong[1] < 0.02
     alone = rk.processing.from_displacement(noisy, DT)
     errors = [np.std(np.asarray(each.samples - GROUND.samples)[100:-100]) for each in (alone, found)]
@@ -65,12 +65,12 @@ def test_a_drift_is_taken_off_up_to_both_ends(drift, error, dt, corner):
     time = DT * np.arange(1501)
     ground = rk.Record(0.2 * np.sin(2 * np.pi * 0.8 * time) * np.exp(-(((time - 7) / 2) ** 2)), DT)
     fine = dt * np.arange(int(15 / dt + 1e-9) + 1)
-    place = CubicHermiteSpline(time, straight(ground).displacement, straight(ground).velocity)(fine)
+    place = CubicHermiteSpline(time, piecewise_linear(ground).displacement, piecewise_linear(ground).velocity)(fine)
     found = rk.processing.fused(rk.Record(ground.samples + drift(time), DT), place, dt, corner=corner)
     count = found.samples.size
     assert count == (1501 if 15 / dt == round(15 / dt) else 1500)
     np.testing.assert_allclose(found.samples, ground.samples[:count], atol=error if dt <= DT else 5e-4)
-    assert abs(straight(found).velocity[-1] - straight(ground).velocity[count - 1]) < 1e-3
+    assert abs(piecewise_linear(found).velocity[-1] - piecewise_linear(ground).velocity[count - 1]) < 1e-3
 
 
 @pytest.mark.parametrize("count", [2, 3, 5])
@@ -84,7 +84,7 @@ def test_noise_of_a_displacement_stays_small_at_both_ends():
     noisy = PLACE + NOISE.normal(0, 1e-4, TIME.size)
     found = rk.processing.fused(rk.Record(GROUND.samples + 0.02, DT), noisy, DT, corner=0.5)
     np.testing.assert_allclose(found.samples, GROUND.samples, atol=3e-4)
-    assert abs(straight(found).velocity[-1] - straight(GROUND).velocity[-1]) < 3e-3
+    assert abs(piecewise_linear(found).velocity[-1] - piecewise_linear(GROUND).velocity[-1]) < 3e-3
 
 
 def test_fast_noise_of_a_displacement_does_not_come_back_as_slow():
@@ -197,7 +197,7 @@ def test_a_pulse_in_noise_is_a_least_square(form, pulse, truth, of):
     record = rk.Record(form(time - truth[-1], *truth[:-1]) + noise, 0.005)
     ranges = {"duration": (0.3, 3.0), "shape": (-8, 8)} if pulse is rk.ExponentialPulse else None
     fit = rk.motions.fit_pulse(record, pulse, ranges, of=of, starts=2)
-    target = straight(record).velocity if of == "velocity" else np.asarray(record.samples)
+    target = piecewise_linear(record).velocity if of == "velocity" else np.asarray(record.samples)
 
     def cost(x):
         if of == "acceleration":

@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 
 import jaxrock as rk
-from jaxrock._aside import written_aside
-from jaxrock._regular_files import open_regular
+from jaxrock._core.atomic_files import written_atomically
+from jaxrock._core.regular_files import open_regular
 from jaxrock.command_line.main import main
 
 READERS = {
@@ -183,7 +183,7 @@ def test_the_target_of_a_link_is_written(tmp_path, writer, there):
 def test_new_files_are_not_written_through_a_link(tmp_path):
     """A writer that replaces nothing refuses a link, even one that leads nowhere."""
     (tmp_path / "link").symlink_to("nowhere")
-    with pytest.raises(FileExistsError), written_aside(tmp_path / "link") as aside:
+    with pytest.raises(FileExistsError), written_atomically(tmp_path / "link") as aside:
         aside.touch()
     assert [each.name for each in tmp_path.iterdir()] == ["link"]
 

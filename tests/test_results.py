@@ -16,7 +16,7 @@ import pytest
 import jaxrock as rk
 from jaxrock.command_line import main as module, results
 from jaxrock.command_line.main import main
-from jaxrock.command_line.results import KNOWN, ResultFolder
+from jaxrock.command_line.results import HASH_FILE, ResultFolder
 from jaxrock.inverse.observation_files import EXAMPLE
 
 RECORD = "acceleration [g]\n" + "".join(f"{0.5 * np.sin(0.3 * k) * np.exp(-0.04 * k):.5f}\n" for k in range(60))
@@ -119,7 +119,7 @@ def test_an_input_is_not_replaced(out, capsys, nothing_computes, command, name, 
     words = {"fragility": ["record.csv", given], "invert": [given]}.get(command, [given])
     assert main([command, *words, "--out", str(out)]) == 2
     assert f"{name} is an input" in capsys.readouterr().err
-    assert (out / name).read_text() == before and names(out) == {name, KNOWN}
+    assert (out / name).read_text() == before and names(out) == {name, HASH_FILE}
 
 
 def test_patterns_name_inputs(out, capsys, nothing_computes):
@@ -138,10 +138,10 @@ def test_one_command_after_the_other_into_one_folder(out, capsys):
     for scale in ("1", "0.9", "1"):
         assert main([*RUN, "record.csv", "--scale", scale, "--out", "out"]) == 0, capsys.readouterr().err
         tables.append((out / "history.csv").read_text())
-        assert names(out) == {*WRITES["run"][1], "animation.mp4", "notes.txt", KNOWN}
+        assert names(out) == {*WRITES["run"][1], "animation.mp4", "notes.txt", HASH_FILE}
     assert tables[0] == tables[2] != tables[1]
     assert (out / "animation.mp4").read_text() == "a film from the field"
-    assert len((out / KNOWN).read_text().splitlines()) == 8  # a title, a film, four files, two of them again
+    assert len((out / HASH_FILE).read_text().splitlines()) == 8  # a title, a film, four files, two of them again
 
 
 def test_a_result_that_was_changed_later_is_not_replaced(out, capsys, nothing_computes):
@@ -177,13 +177,13 @@ def test_a_link_a_pipe_and_a_folder_are_not_replaced(out):
 
 
 def test_a_list_of_another_is_not_written(out):
-    (out / KNOWN).write_text("mine")
+    (out / HASH_FILE).write_text("mine")
     for force in (False, True):
-        with pytest.raises(FileExistsError, match=f"{KNOWN} is not jaxrock's"):
+        with pytest.raises(FileExistsError, match=f"{HASH_FILE} is not jaxrock's"):
             ResultFolder(out, force=force).check(["history.csv"])
-    (out / KNOWN).unlink()
-    (out / KNOWN).symlink_to("../rocks.csv")
-    with pytest.raises(FileExistsError, match=f"{KNOWN} is not jaxrock's"):
+    (out / HASH_FILE).unlink()
+    (out / HASH_FILE).symlink_to("../rocks.csv")
+    with pytest.raises(FileExistsError, match=f"{HASH_FILE} is not jaxrock's"):
         ResultFolder(out).check([])
 
 
@@ -211,7 +211,7 @@ def test_a_killed_run_leaves_results_that_the_next_one_replaces(out, monkeypatch
     monkeypatch.undo()
     assert (out / "map.csv").read_text() == ("second" if moment == "after" else "first")
     ResultFolder(out).check(["map.csv"])
-    assert names(out) == {"map.csv", KNOWN}
+    assert names(out) == {"map.csv", HASH_FILE}
 
 
 def test_two_runs_at_once_know_each_others_results(out):
@@ -227,7 +227,7 @@ def test_a_list_that_a_full_disk_has_cut(out):
     for name in ("map.csv", "map.png"):
         with ResultFolder(out).whole(name) as aside:
             aside.write_text(name)
-    (out / KNOWN).write_bytes((out / KNOWN).read_bytes()[:-20])
+    (out / HASH_FILE).write_bytes((out / HASH_FILE).read_bytes()[:-20])
     with pytest.raises(FileExistsError, match="map.png"):
         ResultFolder(out).check(["map.csv", "map.png"])
     with ResultFolder(out, force=True).whole("map.png") as aside:
@@ -242,7 +242,7 @@ def test_half_of_the_results_are_replaced_by_the_next_run(out, monkeypatch):
             rk.plot, "phase", lambda *_: (_ for _ in ()).throw(OSError(errno.ENOSPC, "No space left on device"))
         )
         assert main([*RUN, "record.csv", "--out", "out", "--quiet"]) == 2
-    assert names(out) == {"history.csv", "impacts.csv", "history.png", KNOWN}
+    assert names(out) == {"history.csv", "impacts.csv", "history.png", HASH_FILE}
     assert main([*RUN, "record.csv", "--out", "out", "--quiet"]) == 0
 
 
@@ -251,7 +251,7 @@ def test_help_tells_of_it(capsys, command):
     with pytest.raises(SystemExit):
         main([command, "--help"])
     text = capsys.readouterr().out
-    assert "--force" in text and KNOWN in text
+    assert "--force" in text and HASH_FILE in text
 
 
 # Streams
@@ -311,7 +311,7 @@ def test_results_are_written_where_words_cannot_be(out, monkeypatch, number, sta
 
     monkeypatch.setattr(sys, "stdout", Once(number))
     assert main([*RUN, "record.csv", "--out", "out"]) == status
-    assert names(out) == {*WRITES["run"][1], KNOWN}
+    assert names(out) == {*WRITES["run"][1], HASH_FILE}
 
 
 @pytest.mark.parametrize("number, status", [(errno.EPIPE, 141), (errno.ENOSPC, 2)])
@@ -326,7 +326,9 @@ def test_errors_that_cannot_be_printed(out, monkeypatch, capsys):
     """The exit status reports the error, and the package's log, which goes to the same stream, stops nothing."""
     monkeypatch.setattr(sys, "stderr", Unwritable(errno.ENOSPC))
     assert main(["run", "missing.AT2"]) == 2
-    monkeypatch.setattr(module, "keep_compiled", lambda: __import__("logging").getLogger("jaxrock").warning("a word"))
+    monkeypatch.setattr(
+        module.cache, "keep_compiled", lambda: __import__("logging").getLogger("jaxrock").warning("a word")
+    )
     assert main([*RUN, "record.csv", "--out", "out", "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["exit_status"] == 0
 

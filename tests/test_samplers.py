@@ -10,7 +10,7 @@ import pytest
 
 import jaxrock as rk
 from jaxrock.inverse.samplers import rounds_of
-from jaxrock.numerics.proposals import independent_proposals
+from jaxrock.numerics.independence_sampler import independent_proposals
 
 numpyro = pytest.importorskip("numpyro")
 blackjax = pytest.importorskip("blackjax")

@@ -90,10 +90,10 @@ def there_and_back(block, other, pulse, kind):
 
 @jax.jit
 def in_every_kind(block, other, pulse):
-    return {kind: there_and_back(block, other, pulse, kind) for kind in similarity.KINDS}
+    return {kind: there_and_back(block, other, pulse, kind) for kind in similarity._KINDS}
 
 
-@pytest.mark.parametrize("kind", similarity.KINDS)
+@pytest.mark.parametrize("kind", similarity._KINDS)
 @pytest.mark.parametrize("pulse", PULSES.values(), ids=PULSES)
 def test_groups_of_pulses(pulse, kind):
     """To groups and back to the pulse; another block's pulse with these groups has them, and goes the same way."""

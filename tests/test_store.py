@@ -117,7 +117,7 @@ def test_order_and_version_count(tmp_path, monkeypatch):
     run(store=tmp_path / "a.zarr")
     with pytest.raises(ValueError, match="other order of the axes"):
         rk.sweep(wave, p=AXES["p"], alpha=AXES["alpha"], store=tmp_path / "a.zarr")
-    monkeypatch.setattr("jaxrock.sweeps.description.version_of", lambda name: f"{name} 0.0.0")
+    monkeypatch.setattr("jaxrock.sweeps.description.cache.version_of", lambda name: f"{name} 0.0.0")
     with pytest.raises(ValueError, match="other version of jaxrock"):
         run(store=tmp_path / "a.zarr")
 

@@ -139,16 +139,16 @@ def test_a_block_that_is_lost_is_missing_again(files, tmp_path):
 @pytest.mark.parametrize("files_written", range(0, 40, 7))
 def test_a_session_may_end_while_a_store_is_marked(files, tmp_path, monkeypatch, files_written):
     """The marks of some arrays are still those of an unfinished store: no file counts as damaged."""
-    path, count, written_aside = tmp_path / "a.zarr", [], description.written_aside
+    path, count, written_atomically = tmp_path / "a.zarr", [], description.written_atomically
     shutil.copytree(files["unfinished.zarr"], path)
 
     def some(*given, **options):
         if len(count) == files_written:
             raise Killed
         count.append(1)
-        return written_aside(*given, **options)
+        return written_atomically(*given, **options)
 
-    monkeypatch.setattr(description, "written_aside", some)
+    monkeypatch.setattr(description, "written_atomically", some)
     try:
         rk.sweep(function, k=NUMBERS, store=path, progress=False)
     except Killed:

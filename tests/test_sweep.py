@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 
 import jaxrock as rk
+from jaxrock.compiler import lane_function
+from jaxrock.compiler.jaxpr.traced_function import TracedFunction
+from jaxrock.compiler.primitive import lanes
 from jaxrock.sweeps.plan import Plan, layout
 from jaxrock.sweeps.runner import Runner
 from jaxrock.sweeps.sweep import surface
-from jaxrock.transforms import batching
-from jaxrock.transforms.differentiation import differentiable
-from jaxrock.transforms.fingerprint import Traced
 
 COMPILED = []
 jax.monitoring.register_event_duration_secs_listener(
@@ -144,18 +144,18 @@ def test_a_gpu_takes_all_lanes_at_once(monkeypatch, points, lanes):
 @pytest.mark.parametrize("points", [1, 64, 65, 100, 128, 129, 5000, 10**6])
 def test_whether_scenes_are_few_is_not_told_by_their_devices(points):
     """Check that few scenes skip the fast pass, which changes last digits, independently of the number of devices."""
-    few = {layout(points, devices, "cpu")[1] <= batching._FEW for devices in (1, 2, 3, 8, 64, 500)}
-    assert few == {points <= batching._FEW}
+    few = {layout(points, devices, "cpu")[1] <= lanes._FEW for devices in (1, 2, 3, 8, 64, 500)}
+    assert few == {points <= lanes._FEW}
 
 
 def test_batches_are_of_few_sizes():
     """Each is compiled: few, that are called few times, and are never filled up beyond the next power of two."""
     sizes = {points: layout(points, 1, "cpu")[1] for points in (*range(1, 3000), *range(3000, 2**14, 97), 10**6)}
     assert len(set(sizes.values())) == 4
-    for points, lanes in sizes.items():
-        calls = -(-points // lanes)
-        assert calls <= 8 or lanes == max(sizes.values())
-        assert calls * lanes <= max(2 ** (points - 1).bit_length(), 128) or points > 2**14
+    for points, size in sizes.items():
+        calls = -(-points // size)
+        assert calls <= 8 or size == max(sizes.values())
+        assert calls * size <= max(2 ** (points - 1).bit_length(), 128) or points > 2**14
 
 
 def test_what_fills_a_batch_up_is_one_of_its_points():
@@ -209,9 +209,9 @@ def test_values_out_of_range_within_a_surface_raise():
 
 def test_checks_do_not_keep_a_program_from_the_cache():
     """JAX keeps no compiled program on disk that may call back to Python, which is how checks raise."""
-    traced = Traced.of(lambda e: rk.Block(0.1, 1.0, e).restitution, {"e": jax.ShapeDtypeStruct((), np.dtype(float))})
+    traced = TracedFunction.of(lambda e: rk.Block(0.1, 1.0, e).restitution, jax.ShapeDtypeStruct((), np.dtype(float)))
     assert "Argument `restitution` must be in [0, 1]" in traced.program.messages
-    assert "callback" not in str(jax.make_jaxpr(traced)(0.5, ()))
+    assert "callback" not in str(jax.make_jaxpr(traced.program)(0.5, ()))
 
 
 def test_progress(capsys):
@@ -230,29 +230,33 @@ def test_a_finished_store_shows_no_bar(capsys, tmp_path):
         assert said in told and " 0it" not in told
 
 
-def point():
-    return {"x": jax.ShapeDtypeStruct((), np.dtype(float))}
+POINT = jax.ShapeDtypeStruct((), np.dtype(float))
 
 
 def test_programs_are_told_apart():
     """Constants are arguments, but part of the fingerprint; arrays within a program are part of it."""
     one, two = jnp.arange(3.0), jnp.arange(3.0) + 1
-    same = Traced.of(lambda x: x * one, point()), Traced.of(lambda x: x * two, point())
-    assert same[0] == same[1] and hash(same[0]) == hash(same[1])
-    assert same[0].fingerprint != same[1].fingerprint == Traced.of(lambda x: x * two, point()).fingerprint
-    assert same[0] != Traced.of(lambda x: x + one, point())
-    assert same[0] != Traced.of(lambda x: {"a": x * one}, point())
-    inner = [Traced.of(lambda x, c=c: jax.jit(lambda y: y * c)(x), point()) for c in (one, two)]
-    assert inner[0] != inner[1] and inner[0].fingerprint != inner[1].fingerprint
-    close = [Traced.of(lambda x, c=c: x * c, point()) for c in (0.1, np.nextafter(0.1, 1))]
-    assert close[0] != close[1] and close[0].fingerprint != close[1].fingerprint
+
+    def traced(function):
+        found = TracedFunction.of(function, POINT)
+        return found.program, found.fingerprint
+
+    same = traced(lambda x: x * one), traced(lambda x: x * two)
+    assert same[0][0] == same[1][0] and hash(same[0][0]) == hash(same[1][0])
+    assert same[0][1] != same[1][1] == traced(lambda x: x * two)[1]
+    assert same[0][0] != traced(lambda x: x + one)[0]
+    assert same[0][0] != traced(lambda x: {"a": x * one})[0]
+    inner = [traced(lambda x, c=c: jax.jit(lambda y: y * c)(x)) for c in (one, two)]
+    assert inner[0][0] != inner[1][0] and inner[0][1] != inner[1][1]
+    close = [traced(lambda x, c=c: x * c) for c in (0.1, np.nextafter(0.1, 1))]
+    assert close[0][0] != close[1][0] and close[0][1] != close[1][1]
     called = [
-        Traced.of(lambda x, f=f: jax.pure_callback(f, point()["x"], x, vmap_method="sequential"), point())
+        traced(lambda x, f=f: jax.pure_callback(f, POINT, x, vmap_method="sequential"))
         for f in (lambda x: x, lambda x: -x)
     ]
-    assert called[0] != called[1]
-    checks = [Traced.of(lambda x: rk.Block(x, 1.0).restitution, point()) for _ in range(2)]
-    assert checks[0] == checks[1]
+    assert called[0][0] != called[1][0]
+    checks = [traced(lambda x: rk.Block(x, 1.0).restitution) for _ in range(2)]
+    assert checks[0][0] == checks[1][0]
 
 
 class Alike:
@@ -272,10 +276,10 @@ def test_programs_of_scenes_are_told_apart():
     """By what they compute, by arrays in them, and by what they call back to; not by how often they were traced."""
 
     def traced(function):
-        return Traced.of(lambda x: differentiable(function)(x), point())
+        return TracedFunction.of(lambda x: lane_function(function)(x), POINT).program
 
     def calling(f):
-        return traced(lambda x: jax.pure_callback(f, point()["x"], x, vmap_method="sequential"))
+        return traced(lambda x: jax.pure_callback(f, POINT, x, vmap_method="sequential"))
 
     assert traced(jnp.sin) == traced(jnp.sin) != traced(jnp.cos)
     arrays = [traced(lambda x, c=np.arange(100.0) + c: x * jnp.asarray(c).sum()) for c in (0.0, 1.0, 1.0)]
@@ -296,9 +300,10 @@ def fresh(code, *, seed="0"):
 
 FINGERPRINT = """
 import jax, numpy as np, jaxrock as rk
-from jaxrock.transforms.fingerprint import Traced
+from jaxrock.compiler.jaxpr.traced_function import TracedFunction
 record = rk.Record(np.arange(5.0), 0.01)
-print(Traced.of(lambda p: rk.outcome(rk.Block(0.1, p), record), {"p": jax.ShapeDtypeStruct((), "float32")}).fingerprint)
+like = jax.ShapeDtypeStruct((), "float32")
+print(TracedFunction.of(lambda p: rk.outcome(rk.Block(0.1, p), record), like).fingerprint)
 """
 USE = "import jax; from jaxrock.studies import use_cpu_devices as use; "
 PRINTED = {

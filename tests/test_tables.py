@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import jaxrock as rk
-from jaxrock._tables import AbstractTable, items_of
+from jaxrock._arguments.tables import AbstractTable, items_of
 from jaxrock.studies.sensitivities import Slopes, SlopeStatus
 
 pytest.importorskip("xarray")

@@ -24,8 +24,8 @@ import pytest
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 import jaxrock as rk
+from jaxrock.compiler import lane_function
 from jaxrock.responses.arguments import _usual, start_of
-from jaxrock.transforms.differentiation import differentiable
 
 BLOCK = rk.Block(0.2, 2.0, 0.9)
 COLUMN = rk.blocks.FlexibleBlock(0.6, 3.0, 30e9, 2500.0, 0.02)
@@ -326,7 +326,7 @@ def test_slopes_of_many_are_those_of_one_and_each_is_computed_once():
 
 def test_functions_of_whole_numbers_are_exported():
     """Check export of functions of whole numbers: integers cannot be NaN."""
-    program = jax.export.export(jax.jit(differentiable(lambda n: {"twice": 2 * n, "half": n / 2})), platforms=["cpu"])
+    program = jax.export.export(jax.jit(lane_function(lambda n: {"twice": 2 * n, "half": n / 2})), platforms=["cpu"])
     made = program(jax.ShapeDtypeStruct((), jnp.int64))
     assert {name: float(x) for name, x in made.call(3).items()} == {"twice": 6, "half": 1.5}
 

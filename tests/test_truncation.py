@@ -11,7 +11,7 @@ import pytest
 import jaxrock as rk
 from jaxrock.engines.scene import Scene
 from jaxrock.engines.state import initial_state
-from jaxrock.engines.taylor.expansion import expand
+from jaxrock.engines.taylor.expansion import taylor_expansion
 from jaxrock.models.coefficients import Coefficients, Terms
 from jaxrock.numerics.polynomial import last_size
 
@@ -63,7 +63,7 @@ def left_out(model, has_vertical, columns):
         state = replace(state, side=jnp.float64(1.0), velocity=velocity, piece=piece)
         shaking, unit = stepper.shaking(state.piece, state.local)
         start, order = stepper.start(state, shaking, unit), stepper.order
-        terms = expand(start, order + MORE).opening
+        terms = taylor_expansion(start, order + MORE).opening
         allowed = stepper.tolerance * jnp.minimum(alpha, jnp.abs(terms[0]) + jnp.abs(terms[1]))
         length = stepper.room(state) / unit
         later = sum(c * length ** (order + 1 + k) for k, c in enumerate(terms[order + 1 :]))

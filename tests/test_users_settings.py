@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 
 import jaxrock as rk
-from jaxrock._settings import in_precision_of_session, kept_by_precision, under_usual_settings, usual_settings
+from jaxrock._core.settings import in_precision_of_session, kept_by_precision, under_usual_settings, usual_settings
 from references.users_settings import CALLS, SETTINGS
 
 ROOT = Path(__file__).parents[1]

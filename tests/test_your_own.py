@@ -607,3 +607,33 @@ def test_factors_of_functions_multiply():
 
     times, once = found(jnp.asarray(0.1))
     assert float(times) == pytest.approx(6 * float(once), rel=1e-15)
+
+
+class Halved(rk.Linear):
+    """Half of all moments."""
+
+    def moments(self, block):
+        return super().moments(block).times(0.5)
+
+
+class HalvedTwice(rk.Linear):
+    """A model equal to `Halved`, from double of the moments."""
+
+    def moments(self, block):
+        return super().moments(block).times(jax.lax.fori_loop(0, 2, lambda _, part: part / 2, 2.0 + 0.0 * block.alpha))
+
+
+def test_a_model_of_ones_own_may_take_turns(caplog):
+    """It is machine code, and differentiated, as the same without a loop."""
+
+    def peak_and_slope(model):
+        def peak(a):
+            pulse, engine = rk.RectangularPulse(a, 0.3), rk.Series(order=8)
+            return rk.outcome(rk.Block(0.2, 2.0, 0.9), pulse, model, engine=engine).max_rotation
+
+        return jax.value_and_grad(peak)(0.25)
+
+    with caplog.at_level("DEBUG", "jaxrock"):
+        found = peak_and_slope(HalvedTwice())
+    assert "left to XLA" not in caplog.text
+    np.testing.assert_allclose(found, peak_and_slope(Halved()), rtol=1e-13)

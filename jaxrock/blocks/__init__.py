@@ -3,7 +3,7 @@
 Imports `numerics`. Start with `rigid`. A new law of restitution is a class like those in `restitution`.
 """
 
-from jaxrock._surface import shown as _shown
+from jaxrock._core.namespace import shown as _shown
 from jaxrock.blocks import restitution as restitution
 from jaxrock.blocks.asymmetric import AsymmetricBlock as AsymmetricBlock
 from jaxrock.blocks.edge import Edge as Edge

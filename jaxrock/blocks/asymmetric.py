@@ -4,31 +4,21 @@ from typing import Annotated, Any
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Bool, Inexact
+from jaxtyping import Array, ArrayLike, Bool
 
-from jaxrock._arguments import arguments, pair, word_of
-from jaxrock._checks import (
-    Range,
-    Values,
-    acute,
-    check_shapes,
-    checked,
-    one_program,
-    rate,
-    ratio,
-    size,
-    strength,
-    with_throw,
-)
-from jaxrock._described import described
-from jaxrock._parameters import Owner, parameter, set_parameters
+from jaxrock._arguments.annotations import arguments, pair, word_of
+from jaxrock._arguments.parameters import Owner, parameter, set_parameters
+from jaxrock._arguments.ranges import Range, acute, checked, rate, ratio, size, strength, with_throw
+from jaxrock._arguments.repr import described
+from jaxrock._core.arrays import Values, check_shapes
+from jaxrock._core.one_program import one_program
+from jaxrock._core.types import Real
 from jaxrock.blocks.outline import Outline
 from jaxrock.blocks.restitution import AbstractRestitution, AngularMomentum, Corners, PerSide, law_of, ratio_of_inertia
 from jaxrock.blocks.rigid import GRAVITY, LENGTHS, Side
 from jaxrock.blocks.rock import section_of
 from jaxrock.numerics.elementary import sine_cosine
 
-Real = Inexact[Array, "..."]
 Ratios = tuple[ArrayLike, ArrayLike] | AbstractRestitution | None
 
 _LARGEST = "be at most p1/sqrt(2 sqrt(inertia_ratio (1 - inertia_ratio))), the largest about any corner"

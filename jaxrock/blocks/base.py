@@ -8,7 +8,7 @@ import warnings
 
 import numpy as np
 
-from jaxrock._precision import frames_of_the_package
+from jaxrock._core.precision import frames_of_the_package
 from jaxrock.blocks.edge import Edge, fitted_edge
 
 _SMOOTH = 0.2  # share of the longest arm of the weight by which a smooth edge may differ from the faces of a mesh

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from jaxrock._settings import kept_by_precision
+from jaxrock._core.settings import kept_by_precision
 
 
 class UnitColumn(NamedTuple):

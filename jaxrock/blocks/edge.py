@@ -6,17 +6,18 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Bool, Float, Inexact, Int
+from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
-from jaxrock._checks import Values, checked, not_negative, one_program, with_throw
-from jaxrock._described import described
-from jaxrock._parameters import parameter, set_parameters
-from jaxrock._settings import called_by_users
-from jaxrock.numerics.choice import where
+from jaxrock._arguments.parameters import parameter, set_parameters
+from jaxrock._arguments.ranges import checked, not_negative, with_throw
+from jaxrock._arguments.repr import described
+from jaxrock._core.arrays import Values
+from jaxrock._core.one_program import one_program
+from jaxrock._core.settings import called_by_users
+from jaxrock._core.types import Real
+from jaxrock.compiler.hints import select
 from jaxrock.numerics.elementary import sine_cosine, sine_cosine_of_any, sine_lag
-from jaxrock.numerics.lookup import count_up_to, pick, stretch_from
-
-Real = Inexact[Array, "..."]
+from jaxrock.numerics.lookup import count_up_to, stretch_from, take
 
 
 class Edge(eqx.Module):
@@ -178,11 +179,11 @@ class EdgePieces(eqx.Module):
         The angle is beyond pi/2 where no piece follows.
         """
         piece, angle, ends = stretch_from(cast(Array, self.start), opening, outward)
-        return self._piece(piece), where(ends, angle, jnp.pi)
+        return self._piece(piece), select(ends, angle, jnp.pi)
 
     def _piece(self, index: Int[Array, ""]) -> "EdgePieces":
         start, slope, *numbers = (
-            pick(x, jnp.maximum(index, 0)) for x in (cast(Array, self.start), self.slope, *self.before)
+            take(x, jnp.maximum(index, 0)) for x in (cast(Array, self.start), self.slope, *self.before)
         )
         return EdgePieces(start, Rounded(*numbers), slope)
 

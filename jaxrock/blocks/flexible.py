@@ -7,14 +7,14 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Inexact
 
-from jaxrock._checks import Range, below_one, checked, one_of, one_program, size, truth, whole, with_throw
-from jaxrock._described import described
-from jaxrock._parameters import Owner, leaves_of, parameter, set_parameters
+from jaxrock._arguments.parameters import Owner, leaves_of, parameter, set_parameters
+from jaxrock._arguments.ranges import Range, below_one, checked, one_of, size, truth, whole, with_throw
+from jaxrock._arguments.repr import described
+from jaxrock._core.one_program import one_program
+from jaxrock._core.types import Real
 from jaxrock.blocks.cantilever import unit_column
 from jaxrock.blocks.restitution import AbstractRestitution, Corners, Housner, Restitution, fits, fitting_width, law_of
 from jaxrock.blocks.rigid import GRAVITY
-
-Real = Inexact[Array, "..."]
 
 _stiff = Range("be positive and finite, from 1e-9 to 1e30", 0.0, math.inf, lambda x: (x >= 1e-9) & (x <= 1e30))
 

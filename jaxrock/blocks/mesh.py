@@ -3,12 +3,12 @@
 import os
 from typing import Any
 
-from jaxrock._arguments import path_of
-from jaxrock._checks import shown
-from jaxrock._regular_files import open_regular
+from jaxrock._arguments.annotations import path_of
+from jaxrock._core.arrays import shown
+from jaxrock._core.regular_files import open_regular
 
 
-def surface_of(mesh: Any) -> Any:
+def trimesh_of(mesh: Any) -> Any:
     """Return a trimesh mesh from a mesh or the path of a file."""
     if isinstance(mesh, (str, os.PathLike)):
         path = path_of("mesh", mesh)

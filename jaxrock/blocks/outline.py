@@ -4,7 +4,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxrock._checks import Values, check_known, strength, whole
+from jaxrock._arguments.ranges import strength, whole
+from jaxrock._core.arrays import Values
+from jaxrock._core.one_program import check_known
 
 
 class Outline(NamedTuple):

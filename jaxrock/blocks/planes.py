@@ -6,8 +6,8 @@ from typing import Annotated, NamedTuple
 import numpy as np
 from jaxtyping import ArrayLike, Bool, Float
 
-from jaxrock._arguments import arguments, at_least, list_of
-from jaxrock._checks import not_negative, scalar
+from jaxrock._arguments.annotations import arguments, at_least, list_of
+from jaxrock._arguments.ranges import not_negative, scalar
 from jaxrock.blocks.rock import Rock
 
 

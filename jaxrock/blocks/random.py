@@ -8,9 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike
 
-from jaxrock._arguments import arguments, at_least, pair
-from jaxrock._checks import not_negative, positive, scalar
-from jaxrock._parameters import broadcast, check_single
+from jaxrock._arguments.annotations import arguments, at_least, pair
+from jaxrock._arguments.parameters import broadcast, check_single
+from jaxrock._arguments.ranges import not_negative, positive, scalar
 from jaxrock.blocks.asymmetric import AsymmetricBlock
 from jaxrock.blocks.restitution import tells_sides
 from jaxrock.blocks.rigid import Block

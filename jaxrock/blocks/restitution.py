@@ -15,19 +15,22 @@ class, here or in a file of yours:
 """
 
 import abc
-from collections.abc import Iterator
+import functools
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Inexact
+from jaxtyping import ArrayLike
 
-from jaxrock._checks import Range, check_shapes, checked, if_traced, is_traced, not_negative, share, size, with_throw
-from jaxrock._described import described
-from jaxrock._parameters import Owner, check_declared, is_ours, parameter, set_parameters
-from jaxrock.numerics.choice import where
+from jaxrock._arguments.parameters import Owner, check_declared, is_ours, parameter, set_parameters
+from jaxrock._arguments.ranges import Range, checked, not_negative, share, size, with_throw
+from jaxrock._arguments.repr import described
+from jaxrock._core.arrays import check_shapes, if_traced, is_traced
+from jaxrock._core.types import Real
+from jaxrock.compiler import trace_function
+from jaxrock.compiler.hints import select
 from jaxrock.numerics.elementary import sine_cosine
 
 __all__ = ["AbstractRestitution", "AngularMomentum", "Constant", "Corners", "Housner", "PerSide", "SpeedDependent"]
@@ -36,8 +39,6 @@ __all__ = ["AbstractRestitution", "AngularMomentum", "Constant", "Corners", "Hou
 def __dir__() -> list[str]:
     return __all__
 
-
-Real = Inexact[Array, "..."]
 
 # m R^2/I about a corner
 ratio_of_inertia = Range("be in (0, 1], and not below 1e-6", 0.0, 1.0, lambda x: (x >= 1e-6) & (x <= 1))
@@ -207,7 +208,7 @@ class PerSide(AbstractRestitution):
         product = self.first * self.second
         rounding = max(1e-12, 4 * float(jnp.finfo(product.dtype).eps))
         product = checked("restitution", product, keeps, lambda x: x <= 1 + rounding)
-        self.first = where(jnp.isnan(product), product, self.first)
+        self.first = select(jnp.isnan(product), product, self.first)
 
     def ratio(self, corners: Corners, speed: Real) -> Real:
         """Return the ratio of the side."""
@@ -265,27 +266,16 @@ def tells_sides(law: AbstractRestitution, corners: Corners) -> bool:
         return False
     arrays, others = eqx.partition((law, corners), eqx.is_array)
 
-    def program(side: int):
-        def ratio(arrays):
-            law, corners = eqx.combine(arrays, others)
-            return law.ratio(corners._replace(side=side), jnp.zeros_like(corners.p))
+    def ratio(side: int, arrays):
+        law, corners = eqx.combine(arrays, others)
+        return law.ratio(corners._replace(side=side), jnp.zeros_like(corners.p))
 
-        return jax.make_jaxpr(ratio)(arrays)
-
-    one, other = program(1), program(-1)
-    if str(one) != str(other):
+    traced: list[Any] = [trace_function(functools.partial(ratio, side), arrays) for side in (1, -1)]
+    one, other = traced
+    if one.program != other.program:
         return True
-    pairs = zip(_arrays_within(one), _arrays_within(other))
+    pairs = zip(one.captured, other.captured, strict=True)
     return any(a is not b and (is_traced((a, b)) or not np.array_equal(a, b)) for a, b in pairs)
-
-
-def _arrays_within(program: Any) -> Iterator:
-    """Yield the constant arrays of a jaxpr, which its text does not show, and of the jaxprs that it calls."""
-    yield from getattr(program, "consts", ())
-    for equation in program.eqns:
-        for part in jax.tree.leaves(equation.params):
-            if hasattr(part, "eqns"):
-                yield from _arrays_within(part)
 
 
 def law_of(
@@ -349,7 +339,7 @@ class Reset(eqx.Module):
             return cls(law, corners, p)
         ratio = law.ratio(corners, jnp.zeros_like(p))
         # Checked for the package's own laws, too: an optimiser's step may leave the range that the constructor checked.
-        ratio = where((ratio >= 0) & (ratio <= most), ratio, jnp.nan)
+        ratio = select((ratio >= 0) & (ratio <= most), ratio, jnp.nan)
         # Set without the check of `Constant`: with corners of unequal height the ratio at one may exceed 1.
         return cls(eqx.tree_at(lambda c: c.value, Constant(0.0), ratio), None, None)
 
@@ -368,7 +358,7 @@ class Reset(eqx.Module):
         if self.corners is None or self.p is None:
             return self._number
         ratio = self.law.ratio(self.corners, speed * self.p)
-        return where((ratio >= 0) & (ratio <= 1), ratio, jnp.nan)
+        return select((ratio >= 0) & (ratio <= 1), ratio, jnp.nan)
 
     def slope(self, speed: Real) -> Real:
         """Return the derivative of the speed after an impact by that before it."""

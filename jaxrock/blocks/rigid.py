@@ -4,9 +4,11 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Inexact
 
-from jaxrock._checks import acute, check_shapes, one_program, rate, shown, size, with_throw
-from jaxrock._described import described
-from jaxrock._parameters import Owner, parameter, set_parameters
+from jaxrock._arguments.parameters import Owner, parameter, set_parameters
+from jaxrock._arguments.ranges import acute, rate, size, with_throw
+from jaxrock._arguments.repr import described
+from jaxrock._core.arrays import check_shapes, shown
+from jaxrock._core.one_program import one_program
 from jaxrock.blocks.restitution import (
     AbstractRestitution,
     Corners,

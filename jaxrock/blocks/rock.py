@@ -9,12 +9,13 @@ from typing import Annotated, Any, NamedTuple
 import numpy as np
 from jaxtyping import ArrayLike, Float, Int
 
-from jaxrock._arguments import arguments, at_least, word_of
-from jaxrock._checks import Values, direction, finite, positive, scalar
-from jaxrock._precision import frames_of_the_package
+from jaxrock._arguments.annotations import arguments, at_least, word_of
+from jaxrock._arguments.ranges import direction, finite, positive, scalar
+from jaxrock._core.arrays import Values
+from jaxrock._core.precision import frames_of_the_package
 from jaxrock.blocks.base import arms_of, rolled, rounded_edge
 from jaxrock.blocks.edge import Edge
-from jaxrock.blocks.mesh import surface_of
+from jaxrock.blocks.mesh import trimesh_of
 from jaxrock.blocks.rigid import LENGTHS
 from jaxrock.blocks.section import Section, section_of_slab
 from jaxrock.blocks.slab import Slab
@@ -59,7 +60,7 @@ class Rock(NamedTuple):
         **Raises:** ValueError for a surface that is not closed, a base that is no area, or a centre of mass that is not
         above it; OSError if the file cannot be opened; ImportError without trimesh.
         """
-        mesh = surface_of(mesh)
+        mesh = trimesh_of(mesh)
         if not bool(mesh.is_volume):
             raise ValueError("Argument `mesh` must be closed and turned outward, but is not: repair it first.")
         factor = LENGTHS[unit]

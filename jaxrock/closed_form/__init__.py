@@ -1,6 +1,6 @@
 """Solutions in closed form. They import no engine, so they can serve as independent checks of the engines."""
 
-from jaxrock._surface import shown as _shown
+from jaxrock._core.namespace import shown as _shown
 from jaxrock.closed_form import (
     pushover as pushover,
     restitution as restitution,

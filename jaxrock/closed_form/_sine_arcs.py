@@ -10,12 +10,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Bool, Float, Inexact, Int
+from jaxtyping import Array, ArrayLike, Bool, Inexact, Int
 
+from jaxrock._core.types import Floats
+from jaxrock.compiler import elementwise
 from jaxrock.numerics.roots import search_root
-from jaxrock.transforms.elementwise import elementwise
 
-Real = Float[Array, "..."]
 Given = Inexact[ArrayLike, "..."]
 
 _MOST_PIECES = 4096
@@ -24,15 +24,15 @@ _MOST_PIECES = 4096
 class Lane(eqx.Module):
     """State of the block; speeds are outward and per p t."""
 
-    angle: Real  # of the sine
-    side: Real  # of the rotation
-    opening: Real
-    speed: Real
+    angle: Floats  # of the sine
+    side: Floats  # of the rotation
+    opening: Floats
+    speed: Floats
     impacts: Int[Array, "..."]
     done: Bool[Array, "..."]
 
 
-def arc(time: Real, lane: Lane, intensity: Real, ratio: Real) -> tuple[Real, Real]:
+def opening_and_speed(time: Floats, lane: Lane, intensity: Floats, ratio: Floats) -> tuple[Floats, Floats]:
     """Return opening and speed at a time after `lane`; D&D 3.4, written so that nothing cancels."""
     push = lane.side * intensity / (1 + ratio**2)
     sine, cosine = push * jnp.sin(lane.angle), push * jnp.cos(lane.angle)
@@ -46,20 +46,20 @@ def arc(time: Real, lane: Lane, intensity: Real, ratio: Real) -> tuple[Real, Rea
     return opening, speed
 
 
-def start(intensity: Real) -> Lane:
+def start(intensity: Floats) -> Lane:
     """Return the state at uplift, where the sine first reaches the threshold."""
     zero = jnp.zeros_like(intensity)
     count = jnp.zeros(intensity.shape, jnp.int32)
     return Lane(uplift_phase(intensity), zero - 1, zero, zero, count, zero > 0)
 
 
-def uplift_phase(intensity: Real) -> Real:
+def uplift_phase(intensity: Floats) -> Floats:
     """Return psi, the phase of the sine at uplift; D&D 3.3."""
     return jnp.arctan2(1.0, jnp.sqrt((intensity - 1) * (intensity + 1)))
 
 
-@elementwise(refilled=True)  # some blocks take thousands of arcs, most only a few
-def follow(intensity: Given, ratio: Given, restitution: Given) -> Lane:
+@elementwise(refill=True)  # some blocks take thousands of arcs, most only a few
+def at_pulse_end(intensity: Given, ratio: Given, restitution: Given) -> Lane:
     """Return the state at the end of the pulse; not `done` where the impacts exceed the limit."""
 
     def going(carry):
@@ -73,13 +73,13 @@ def follow(intensity: Given, ratio: Given, restitution: Given) -> Lane:
     return jax.lax.while_loop(going, step, (0, start(intensity)))[1]
 
 
-def _next(lane: Lane, intensity: Real, ratio: Real, restitution: Real) -> Lane:
+def _next(lane: Lane, intensity: Floats, ratio: Floats, restitution: Floats) -> Lane:
     """Advance to the next impact or change of sign of the driving; a block at rest goes to its next uplift."""
     new, hit = piece(lane, intensity, ratio, restitution)
     return _rested(new, hit, intensity, ratio, restitution, uplift_phase(intensity))
 
 
-def piece(lane: Lane, intensity: Real, ratio: Real, restitution: Real) -> tuple[Lane, Bool[Array, "..."]]:
+def piece(lane: Lane, intensity: Floats, ratio: Floats, restitution: Floats) -> tuple[Lane, Bool[Array, "..."]]:
     """Advance to the next impact or change of sign of the driving; return the state, and whether it is an impact."""
     psi = uplift_phase(intensity)
     on, off = (jnp.where(lane.side < 0, angle, jnp.pi + angle) for angle in (psi, jnp.pi - psi))
@@ -87,24 +87,26 @@ def piece(lane: Lane, intensity: Real, ratio: Real, restitution: Real) -> tuple[
     edge = jnp.where(lane.angle < on, on, jnp.where(lane.angle < off, off, end))
     driven = (lane.angle >= on) & (lane.angle < off)
     span = (edge - lane.angle) / ratio
-    opening, speed = arc(span, lane, intensity, ratio)
+    opening, speed = opening_and_speed(span, lane, intensity, ratio)
 
     # The lowest point of a dip of a driven block: there its speed is zero.
     dips = driven & (lane.speed < 0) & (speed > 0)
     lowest = jax.lax.cond(
         jnp.any(dips),
-        lambda: search_root(lambda t: arc(t, lane, intensity, ratio)[1], 0 * span, jnp.where(dips, span, 0.0)),
+        lambda: search_root(
+            lambda t: opening_and_speed(t, lane, intensity, ratio)[1], 0 * span, jnp.where(dips, span, 0.0)
+        ),
         lambda: span,
     )
     lowest = jnp.where(dips, lowest, span)
-    down = arc(lowest, lane, intensity, ratio)[0] <= 0
+    down = opening_and_speed(lowest, lane, intensity, ratio)[0] <= 0
     hit = down & jnp.where(driven, lane.speed < 0, True)
 
     # After an impact, opening over time has no zero at the start.
     grounded = lane.opening == 0
 
     def height(time):
-        value = arc(time, lane, intensity, ratio)[0]
+        value = opening_and_speed(time, lane, intensity, ratio)[0]
         divided = grounded & (time > 0)
         return jnp.where(divided, value / jnp.where(divided, time, 1.0), jnp.where(grounded, lane.speed, value))
 
@@ -115,7 +117,7 @@ def piece(lane: Lane, intensity: Real, ratio: Real, restitution: Real) -> tuple[
     before = jnp.where((early < after) & (height(jnp.minimum(early, span)) > 0), early, 0.0)
     after = jnp.where((late < after) & (height(jnp.minimum(late, span)) <= 0), late, after)
     time = search_root(height, jnp.where(hit, before, 0.0), after)
-    arrival = -arc(time, lane, intensity, ratio)[1]
+    arrival = -opening_and_speed(time, lane, intensity, ratio)[1]
     landed = Lane(
         angle=lane.angle + ratio * time,
         side=-lane.side,
@@ -128,7 +130,7 @@ def piece(lane: Lane, intensity: Real, ratio: Real, restitution: Real) -> tuple[
     return jax.tree.map(lambda a, b: jnp.where(hit, a, b), landed, passed), hit
 
 
-def _rested(lane: Lane, hit, intensity: Real, ratio: Real, restitution: Real, psi: Real) -> Lane:
+def _rested(lane: Lane, hit, intensity: Floats, ratio: Floats, restitution: Floats, psi: Floats) -> Lane:
     """Advance a block to its next uplift, if it is at rest or will be before the ground can drive it."""
     sine = intensity * jnp.sin(lane.angle)
     # Lower bound of the restoring between the two driving stretches; hops end after 2 speed/(restoring (1 - e)).

@@ -6,15 +6,12 @@ here.
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float, Inexact
+from jaxtyping import Array
 
-from jaxrock._checks import checked, finite, positive, share
+from jaxrock._arguments.ranges import checked, finite, positive, share
 from jaxrock.closed_form import _sine_arcs as arcs
+from jaxrock.compiler import elementwise
 from jaxrock.numerics.roots import bracketed_root
-from jaxrock.transforms.elementwise import elementwise
-
-Real = Inexact[ArrayLike, "..."]
-Result = Float[Array, "..."]
 
 
 def _above_one(name, value):
@@ -77,7 +74,7 @@ def impact_at_end(w: Array) -> Array:
 
 def first_excursion(time: Array, a: Array, w: Array) -> tuple[Array, Array]:
     """Return opening and speed of the first excursion; D&D 3.4."""
-    return arcs.arc(time, arcs.start(a), a, w)
+    return arcs.opening_and_speed(time, arcs.start(a), a, w)
 
 
 def impact_during_pulse(a: Array, w: Array) -> Array:

@@ -6,10 +6,10 @@ Also the static resistance of the spring models that replace the block, and thei
 from typing import Any
 
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Float, Inexact
 
-from jaxrock._checks import acute, below_one, checked, not_negative, one_of, share
-from jaxrock.transforms.elementwise import elementwise
+from jaxrock._arguments.ranges import acute, below_one, checked, not_negative, one_of, share
+from jaxrock._core.types import Floats, RealLike
+from jaxrock.compiler import elementwise
 
 __all__ = [
     "amplitude_after", "energy", "force", "overturning_moment_ratio", "period", "spring_force",
@@ -19,10 +19,6 @@ __all__ = [
 
 def __dir__() -> list[str]:
     return __all__
-
-
-Real = Inexact[ArrayLike, "..."]
-Result = Float[Array, "..."]
 
 
 def _leaning(name, value):
@@ -40,7 +36,7 @@ _of_springs = elementwise(alpha=acute, rotation=_leaning)
 
 
 @_elementwise
-def force(rotation: Real, alpha: Real) -> Result:
+def force(rotation: RealLike, alpha: RealLike) -> Floats:
     """Horizontal force at the centre of mass, over the weight, that holds the block at a rotation.
 
     At rotation 0 it is the acceleration in g at which the block uplifts; it is zero at alpha, where the block
@@ -77,7 +73,7 @@ def _force_plastic_height(rotation, alpha):
     return jnp.tan(alpha) / jnp.cos(rotation) - jnp.tan(rotation)  # D&F 2017, 19
 
 
-def spring_force(rotation: Real, alpha: Real, kind: str = "SM1", law: str = "linear") -> Result:
+def spring_force(rotation: RealLike, alpha: RealLike, kind: str = "SM1", law: str = "linear") -> Floats:
     """Horizontal force at the mass, over the weight, that holds a spring model at a rotation: its pushover curve.
 
     **Arguments:**
@@ -100,7 +96,7 @@ def spring_force(rotation: Real, alpha: Real, kind: str = "SM1", law: str = "lin
 
 
 @_of_springs
-def overturning_moment_ratio(rotation: Real, alpha: Real) -> Result:
+def overturning_moment_ratio(rotation: RealLike, alpha: RealLike) -> Floats:
     """Overturning moment of the spring models over that of the block, under one ground acceleration.
 
     **Arguments:**
@@ -116,7 +112,7 @@ def overturning_moment_ratio(rotation: Real, alpha: Real) -> Result:
 
 
 @_elementwise
-def energy(rotation: Real, alpha: Real) -> Result:
+def energy(rotation: RealLike, alpha: RealLike) -> Floats:
     """Work over m g R that brings the block from rest to a rotation.
 
     **Arguments:**
@@ -133,7 +129,7 @@ def energy(rotation: Real, alpha: Real) -> Result:
 
 
 @_elementwise
-def toppling_velocity(alpha: Real) -> Result:
+def toppling_velocity(alpha: RealLike) -> Floats:
     """Angular velocity over p with which a block must leave the ground to reach its balance: 2 sin(alpha/2).
 
     **Source:** Housner (1963), the energy that overturns.
@@ -142,7 +138,7 @@ def toppling_velocity(alpha: Real) -> Result:
 
 
 @_elementwise
-def period(amplitude: Real) -> Result:
+def period(amplitude: RealLike) -> Floats:
     """Period of the free rocking of a slender block, times p.
 
     **Arguments:**
@@ -157,7 +153,7 @@ def period(amplitude: Real) -> Result:
 
 
 @_elementwise
-def amplitude_after(impacts: Real, amplitude: Real, restitution: Real) -> Result:
+def amplitude_after(impacts: RealLike, amplitude: RealLike, restitution: RealLike) -> Floats:
     """Largest rotation over alpha of a slender block after a number of impacts in free rocking.
 
     **Arguments:**

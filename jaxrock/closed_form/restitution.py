@@ -3,8 +3,8 @@
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float, Inexact
 
-from jaxrock._checks import Range, acute
-from jaxrock.transforms.elementwise import elementwise
+from jaxrock._arguments.ranges import Range, acute
+from jaxrock.compiler import elementwise
 
 __all__ = ["housner"]
 

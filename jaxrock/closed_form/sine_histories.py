@@ -4,13 +4,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from jaxrock._core.types import Floats, RealLike
 from jaxrock.closed_form import _sine_arcs as arcs, _sine_formulas as formulas
-from jaxrock.closed_form._sine_formulas import Real, Result, elementwise_in_sine
+from jaxrock.closed_form._sine_formulas import elementwise_in_sine
 
 _PIECES = 3  # after an impact during the pulse: before, within and after the second driving stretch
 
 
-def rotation(time: Real, intensity: Real, frequency_ratio: Real, restitution: Real) -> Result:
+def rotation(time: RealLike, intensity: RealLike, frequency_ratio: RealLike, restitution: RealLike) -> Floats:
     """Rotation over alpha, from uplift over the first impact to the second.
 
     **Arguments:**
@@ -29,7 +30,7 @@ def rotation(time: Real, intensity: Real, frequency_ratio: Real, restitution: Re
     return _history(time, intensity, frequency_ratio, restitution)[0]
 
 
-def velocity(time: Real, intensity: Real, frequency_ratio: Real, restitution: Real) -> Result:
+def velocity(time: RealLike, intensity: RealLike, frequency_ratio: RealLike, restitution: RealLike) -> Floats:
     """Angular velocity over p alpha, with the arguments of `rotation`; at an impact, that before it.
 
     **Source:** D&D 3.4 and 3.5; 3.11 at the end of the pulse.
@@ -38,7 +39,7 @@ def velocity(time: Real, intensity: Real, frequency_ratio: Real, restitution: Re
 
 
 @elementwise_in_sine
-def impact_velocity(intensity: Real, frequency_ratio: Real) -> Result:
+def impact_velocity(intensity: RealLike, frequency_ratio: RealLike) -> Floats:
     """Angular velocity over p alpha just before the first impact; NaN where the block overturns before.
 
     **Arguments:** as in `rotation`.
@@ -52,7 +53,9 @@ def impact_velocity(intensity: Real, frequency_ratio: Real) -> Result:
 
 
 @elementwise_in_sine
-def _history(time: Real, intensity: Real, frequency_ratio: Real, restitution: Real) -> tuple[Result, Result]:
+def _history(
+    time: RealLike, intensity: RealLike, frequency_ratio: RealLike, restitution: RealLike
+) -> tuple[Floats, Floats]:
     """Return rotation and velocity, computed together."""
     a, w, e = intensity, frequency_ratio, restitution
     end, impact = formulas.end_of_pulse(a, w), formulas.first_impact(a, w)
@@ -76,7 +79,7 @@ def _history(time: Real, intensity: Real, frequency_ratio: Real, restitution: Re
 def _flight(since: Array, left: Array, lane: arcs.Lane, a: Array, w: Array) -> tuple[Array, Array]:
     """Return opening and speed at a time since `lane`: D&D 3.4 for the `left` part of the pulse, then 3.5."""
     lasts = since <= left
-    opening, speed = arcs.arc(jnp.where(lasts, since, left), lane, a, w)
+    opening, speed = arcs.opening_and_speed(jnp.where(lasts, since, left), lane, a, w)
     free = jnp.where(lasts, 0.0, since - left)
     sinh, cosh, rise = jnp.sinh(free), jnp.cosh(free), 2 * jnp.sinh(free / 2) ** 2
     return opening * cosh + speed * sinh - rise, opening * sinh + speed * cosh - sinh

@@ -7,9 +7,9 @@ import jax
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxrock._arguments import arguments, at_least, known
-from jaxrock._checks import Range, share
-from jaxrock._described import described
+from jaxrock._arguments.annotations import arguments, at_least, known
+from jaxrock._arguments.ranges import Range, share
+from jaxrock._arguments.repr import described
 from jaxrock.closed_form import _sine_arcs as arcs
 from jaxrock.closed_form.sine_limits import after_pulse_limits, impact_time_limit, no_impact_limit
 
@@ -117,7 +117,7 @@ def _at(points: np.ndarray, ratio: float, restitution: float) -> tuple[np.ndarra
     """Return `growth` at the end of the pulse, and the impacts before overturning, at points of any shape."""
     if not points.size:
         return np.zeros(points.shape), np.zeros(points.shape, int)
-    end: Any = jax.tree.map(np.asarray, arcs.follow(points.ravel(), ratio, restitution))
+    end: Any = jax.tree.map(np.asarray, arcs.at_pulse_end(points.ravel(), ratio, restitution))
     directly = end.opening + end.speed > 1
     return arcs.growth(end, restitution).reshape(points.shape), (end.impacts + ~directly).reshape(points.shape)
 

@@ -6,15 +6,16 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from jaxrock._core.types import Floats, RealLike
 from jaxrock.closed_form import _sine_formulas as formulas
-from jaxrock.closed_form._sine_formulas import Real, Result, elementwise_in_sine
+from jaxrock.closed_form._sine_formulas import elementwise_in_sine
 from jaxrock.numerics.roots import bracketed_root
 
 _GRID = 256  # samples that may bracket a root of case 1.1, the topmost first
 
 
 @elementwise_in_sine
-def no_impact_limit(frequency_ratio: Real) -> Result:
+def no_impact_limit(frequency_ratio: RealLike) -> Floats:
     """Least intensity that overturns a block without impact (case 2), at any restitution.
 
     **Source:** D&D 3.10.
@@ -23,7 +24,7 @@ def no_impact_limit(frequency_ratio: Real) -> Result:
 
 
 @elementwise_in_sine
-def impact_time_limit(frequency_ratio: Real) -> Result:
+def impact_time_limit(frequency_ratio: RealLike) -> Floats:
     """Intensity at which the first impact comes just as the pulse ends; above it, the impact comes later.
 
     **Source:** D&D 3.31.
@@ -32,7 +33,7 @@ def impact_time_limit(frequency_ratio: Real) -> Result:
 
 
 @elementwise_in_sine
-def after_pulse_limits(frequency_ratio: Real, restitution: Real) -> tuple[Result, Result]:
+def after_pulse_limits(frequency_ratio: RealLike, restitution: RealLike) -> tuple[Floats, Floats]:
     """Both ends of the intensities at which a block overturns after one impact that comes after the pulse (case 1.2).
 
     **Returns:** (lower, upper); lower is `impact_time_limit` where the interval continues below it; both inf where
@@ -63,7 +64,7 @@ def after_pulse_limits(frequency_ratio: Real, restitution: Real) -> tuple[Result
 
 
 @elementwise_in_sine
-def during_pulse_limit(frequency_ratio: Real, restitution: Real) -> Result:
+def during_pulse_limit(frequency_ratio: RealLike, restitution: RealLike) -> Floats:
     """Least intensity from which, up to `impact_time_limit`, one impact during the pulse overturns a block (case 1.1).
 
     **Returns:** the intensity; inf where there is no such interval.
@@ -79,7 +80,7 @@ def during_pulse_limit(frequency_ratio: Real, restitution: Real) -> Result:
 
 
 @elementwise_in_sine
-def approximate_during_pulse_limit(frequency_ratio: Real, restitution: Real) -> Result:
+def approximate_during_pulse_limit(frequency_ratio: RealLike, restitution: RealLike) -> Floats:
     """Case 1.1 without a transcendental equation: D&D's approximation of `during_pulse_limit`.
 
     Within 1 % for frequency ratios from 2.5 to below 4 and restitutions of 0.8 to 0.96; below 2 it is 2 to 6 % low,

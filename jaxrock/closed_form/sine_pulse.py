@@ -14,9 +14,10 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from jaxrock._described import described
+from jaxrock._arguments.repr import described
+from jaxrock._core.types import Floats, RealLike
 from jaxrock.closed_form import _sine_arcs as arcs, _sine_formulas as formulas
-from jaxrock.closed_form._sine_formulas import Real, Result, elementwise_in_sine
+from jaxrock.closed_form._sine_formulas import elementwise_in_sine
 from jaxrock.closed_form.sine_histories import (
     impact_velocity as impact_velocity,
     rotation as rotation,
@@ -52,16 +53,16 @@ class Constants(eqx.Module):
 
     __repr__ = described
 
-    A0: Result
-    B0: Result
-    C0: Result
-    D0: Result
-    phase: Result
-    end: Result
+    A0: Floats
+    B0: Floats
+    C0: Floats
+    D0: Floats
+    phase: Floats
+    end: Floats
 
 
 @elementwise_in_sine
-def constants(intensity: Real, frequency_ratio: Real) -> Constants:
+def constants(intensity: RealLike, frequency_ratio: RealLike) -> Constants:
     """Constants in the formulas of the sine pulse.
 
     **Arguments:**
@@ -81,7 +82,7 @@ def constants(intensity: Real, frequency_ratio: Real) -> Constants:
 
 
 @elementwise_in_sine
-def impact_time(intensity: Real, frequency_ratio: Real) -> Result:
+def impact_time(intensity: RealLike, frequency_ratio: RealLike) -> Floats:
     """Time at which the block first falls back to the ground, p t from uplift; inf where it overturns before.
 
     **Source:** D&D 3.21 (while the pulse lasts), 3.13 (after it).
@@ -90,7 +91,7 @@ def impact_time(intensity: Real, frequency_ratio: Real) -> Result:
 
 
 @elementwise_in_sine
-def approximate_impact_time(intensity: Real, frequency_ratio: Real) -> Result:
+def approximate_impact_time(intensity: RealLike, frequency_ratio: RealLike) -> Floats:
     """D&D's approximation of `impact_time` while the pulse lasts; NaN where the formula is not real.
 
     **Source:** D&D 3.29.
@@ -99,7 +100,7 @@ def approximate_impact_time(intensity: Real, frequency_ratio: Real) -> Result:
 
 
 @elementwise_in_sine
-def peak_after_pulse(intensity: Real, frequency_ratio: Real, restitution: Real) -> Result:
+def peak_after_pulse(intensity: RealLike, frequency_ratio: RealLike, restitution: RealLike) -> Floats:
     """Largest rotation over alpha after the first impact, where that comes after the pulse.
 
     Exact between `impact_time_limit` and `no_impact_limit`. Below, the impact comes while the pulse lasts: the value is
@@ -116,7 +117,7 @@ def peak_after_pulse(intensity: Real, frequency_ratio: Real, restitution: Real) 
 
 
 @elementwise_in_sine
-def restitution_scale_law(intensity: Real, frequency_ratio: Real, restitution: Real) -> Result:
+def restitution_scale_law(intensity: RealLike, frequency_ratio: RealLike, restitution: RealLike) -> Floats:
     """`peak_after_pulse` for small peaks: proportional to the square of the restitution.
 
     **Returns:** inf where the block overturns without impact.
@@ -135,7 +136,7 @@ def _energy_after_impact(a: Array, w: Array, e: Array) -> Array:
 
 
 @elementwise_in_sine
-def first_peak(intensity: Real, frequency_ratio: Real) -> Result:
+def first_peak(intensity: RealLike, frequency_ratio: RealLike) -> Floats:
     """Largest rotation over alpha before the first impact; inf where the block overturns without impact.
 
     **Source:** D&D 3.4, 3.5 where the velocity is zero.

@@ -14,12 +14,13 @@ singularities at shape 0 and duration 2 |shape|, and nothing cancels.
 import enum
 
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Float, Inexact, Int
+from jaxtyping import Array, Int
 
-from jaxrock._checks import not_nan, positive
+from jaxrock._arguments.ranges import not_nan, positive
+from jaxrock._core.types import Floats, RealLike
+from jaxrock.compiler import elementwise
 from jaxrock.numerics.divided_differences import exponential_difference, growth_ratio, logarithm_ratio
 from jaxrock.numerics.roots import bracketed_root
-from jaxrock.transforms.elementwise import elementwise
 
 __all__ = [
     "Region", "critical_duration", "critical_shape", "falling_wall", "peak_border", "peak_rotation",
@@ -30,9 +31,6 @@ __all__ = [
 def __dir__() -> list[str]:
     return __all__
 
-
-Real = Inexact[ArrayLike, "..."]
-Result = Float[Array, "..."]
 
 _MOST_SHAPE = 1e17  # beyond, the pulse is its limit to rounding
 _STEEP = 30.0  # beyond, exponentials of -shape enter the sums at other places
@@ -53,7 +51,7 @@ _elementwise = elementwise(uplift_strength=positive, pulse_duration=positive, sh
 
 
 @_elementwise
-def pulse(time: Real, shape: Real) -> Result:
+def pulse(time: RealLike, shape: RealLike) -> Floats:
     """Ground acceleration over its peak.
 
     **Arguments:**
@@ -74,7 +72,7 @@ def pulse(time: Real, shape: Real) -> Result:
 
 
 @_elementwise
-def uplift_time(uplift_strength: Real, shape: Real) -> Result:
+def uplift_time(uplift_strength: RealLike, shape: RealLike) -> Floats:
     """Time at which the block uplifts [t_d]; inf where it does not.
 
     **Source:** V 2.4.
@@ -84,7 +82,7 @@ def uplift_time(uplift_strength: Real, shape: Real) -> Result:
 
 
 @_elementwise
-def safety_wall(pulse_duration: Real, shape: Real) -> Result:
+def safety_wall(pulse_duration: RealLike, shape: RealLike) -> Floats:
     """Uplift strength below which a block overturns, at any restitution.
 
     **Arguments:**
@@ -98,7 +96,7 @@ def safety_wall(pulse_duration: Real, shape: Real) -> Result:
 
 
 @_elementwise
-def rising_wall(pulse_duration: Real, shape: Real) -> Result:
+def rising_wall(pulse_duration: RealLike, shape: RealLike) -> Floats:
     """Uplift strength below which a block is past alpha before the pulse has its peak: between O1 and O2.
 
     **Source:** V 3.8b, 3.9b, 3.10b.
@@ -109,7 +107,7 @@ def rising_wall(pulse_duration: Real, shape: Real) -> Result:
 
 
 @_elementwise
-def falling_wall(pulse_duration: Real, shape: Real) -> Result:
+def falling_wall(pulse_duration: RealLike, shape: RealLike) -> Floats:
     """Uplift strength below which a block is past alpha before the pulse ends: between O2 and O3.
 
     **Source:** V 3.8a (without the term -f^2 that is printed on its right), 3.9a, 3.10a corrected.
@@ -120,7 +118,7 @@ def falling_wall(pulse_duration: Real, shape: Real) -> Result:
 
 
 @_elementwise
-def peak_border(pulse_duration: Real, shape: Real) -> Result:
+def peak_border(pulse_duration: RealLike, shape: RealLike) -> Floats:
     """Uplift strength at which a block has its largest rotation just as the pulse ends: between S2 and S1.
 
     **Source:** V 3.15a at time 1.
@@ -131,7 +129,7 @@ def peak_border(pulse_duration: Real, shape: Real) -> Result:
 
 
 @_elementwise
-def rotation(time: Real, uplift_strength: Real, pulse_duration: Real, shape: Real) -> Result:
+def rotation(time: RealLike, uplift_strength: RealLike, pulse_duration: RealLike, shape: RealLike) -> Floats:
     """Rotation over alpha, from the start of the pulse to the block's first return to the ground.
 
     **Arguments:**
@@ -150,7 +148,7 @@ def rotation(time: Real, uplift_strength: Real, pulse_duration: Real, shape: Rea
 
 
 @_elementwise
-def velocity(time: Real, uplift_strength: Real, pulse_duration: Real, shape: Real) -> Result:
+def velocity(time: RealLike, uplift_strength: RealLike, pulse_duration: RealLike, shape: RealLike) -> Floats:
     """Angular velocity over p alpha, with the arguments of `rotation`.
 
     **Source:** V 3.3, 3.5, 3.7.
@@ -159,7 +157,7 @@ def velocity(time: Real, uplift_strength: Real, pulse_duration: Real, shape: Rea
 
 
 @_elementwise
-def peak_time(uplift_strength: Real, pulse_duration: Real, shape: Real) -> Result:
+def peak_time(uplift_strength: RealLike, pulse_duration: RealLike, shape: RealLike) -> Floats:
     """Time of the largest rotation [t_d]: inf for a block that overturns, 1/2 (the limit) for one that stays at rest.
 
     **Source:** V 3.15a, 3.15b, 3.16, 3.17a and b corrected.
@@ -168,7 +166,7 @@ def peak_time(uplift_strength: Real, pulse_duration: Real, shape: Real) -> Resul
 
 
 @_elementwise
-def peak_rotation(uplift_strength: Real, pulse_duration: Real, shape: Real) -> Result:
+def peak_rotation(uplift_strength: RealLike, pulse_duration: RealLike, shape: RealLike) -> Floats:
     """Largest rotation over alpha, at any restitution: inf for a block that overturns.
 
     **Arguments:** as in `rotation`.
@@ -182,7 +180,7 @@ def peak_rotation(uplift_strength: Real, pulse_duration: Real, shape: Real) -> R
 
 
 @_elementwise
-def region(uplift_strength: Real, pulse_duration: Real, shape: Real) -> Int[Array, "..."]:
+def region(uplift_strength: RealLike, pulse_duration: RealLike, shape: RealLike) -> Int[Array, "..."]:
     """The outcome of the block: one of the numbers in `Region`.
 
     **Source:** V figures 3.1 to 3.3.
@@ -198,7 +196,7 @@ def region(uplift_strength: Real, pulse_duration: Real, shape: Real) -> Int[Arra
 
 
 @_elementwise
-def critical_duration(uplift_strength: Real, shape: Real) -> Result:
+def critical_duration(uplift_strength: RealLike, shape: RealLike) -> Floats:
     """Least pulse duration p t_d that overturns a block; inf for one that does not uplift.
 
     **Source:** the inverse of V 3.12; -log(1 - strength) for a rectangle.
@@ -217,7 +215,7 @@ def critical_duration(uplift_strength: Real, shape: Real) -> Result:
 
 
 @_elementwise
-def critical_shape(uplift_strength: Real, pulse_duration: Real) -> Result:
+def critical_shape(uplift_strength: RealLike, pulse_duration: RealLike) -> Floats:
     """Shape below which a block overturns; -inf where not even a rectangle overturns it.
 
     **Source:** the inverse of V 3.12.

@@ -4,7 +4,7 @@ import argparse
 
 from jaxrock.command_line.command import Command
 from jaxrock.command_line.output import Report
-from jaxrock.keeping.folder import OF_JAX, clear, folder, kept
+from jaxrock.compiler import cache
 
 
 def _add_options(parser: argparse.ArgumentParser) -> None:
@@ -12,16 +12,16 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def _run(arguments: argparse.Namespace, report: Report) -> None:
-    place = folder()
+    place = cache.folder()
     if place is None:
         report.results |= {"folder": None, "programs": 0, "mebibytes": 0.0}
         return report.say("nothing is kept: JAXROCK_CACHE is off")
-    files = [file for file in kept() if file.exists()]
+    files = [file for file in cache.files() if file.exists()]
     size = sum(file.stat().st_size for file in files) / 2**20
-    programs = sum(file.parent.name != OF_JAX or file.name.endswith("-cache") for file in files)
+    programs = sum(map(cache.is_program, files))
     if arguments.clear:
-        clear()
-        if left := [file for file in kept() if file.exists()]:
+        cache.clear()
+        if left := [file for file in cache.files() if file.exists()]:
             raise OSError(f"{len(left)} of {len(files)} files in {place} cannot be deleted, such as {left[0]}")
     report.results |= {"folder": str(place), "programs": programs, "mebibytes": size, "deleted": arguments.clear}
     report.say(f"{programs} compiled programs, {size:.1f} MiB, {'deleted from' if arguments.clear else 'in'} {place}")

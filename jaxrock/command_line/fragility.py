@@ -15,25 +15,27 @@ from jaxrock.command_line.options import (
     check_range,
     files_of,
     model_of,
-    number,
+    plain_float,
 )
-from jaxrock.command_line.output import Entry, Report, save, write_csv
+from jaxrock.command_line.output import Entry, Report, save, write_table
 from jaxrock.command_line.results import ResultFolder
 
 
 def _add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("records", nargs="+", metavar="RECORD", help="files of accelerograms, of any format")
-    parser.add_argument("--width", type=number, default=0.6, help="full width [m] (default 0.6)")
-    parser.add_argument("--height", type=number, default=3.0, help="full height [m] (default 3)")
+    parser.add_argument("--width", type=plain_float, default=0.6, help="full width [m] (default 0.6)")
+    parser.add_argument("--height", type=plain_float, default=3.0, help="full height [m] (default 3)")
     parser.add_argument(
         "--measure",
         default="PGA",
         help="of PGA [g], PGV [m/s], PGD [m], IA [m/s], CAV [m/s], SA(0.5) [g], SV(0.5) [m/s] (default PGA)",
     )
-    ends: dict[str, Any] = {"type": number, "nargs": 2, "metavar": ("FROM", "TO")}
+    ends: dict[str, Any] = {"type": plain_float, "nargs": 2, "metavar": ("FROM", "TO")}
     parser.add_argument("--levels", default=(0.1, 2.0), help="range of the measure (default 0.1 2)", **ends)
     parser.add_argument("--points", type=int, default=24, help="levels, in equal ratios (default 24)")
-    parser.add_argument("--scatter", type=number, default=0.0, help="standard deviation of ln slenderness (default 0)")
+    parser.add_argument(
+        "--scatter", type=plain_float, default=0.0, help="standard deviation of ln slenderness (default 0)"
+    )
     parser.add_argument("--draws", type=int, default=32, help="blocks that are drawn if it is not 0 (default 32)")
     add_restitution(parser)
     add_description(parser)
@@ -98,7 +100,7 @@ def _write(
     """Write tables, the figure, and NRML if there is a fit."""
     folder: ResultFolder = arguments.out
     header = f"{found.measure},lower,upper"
-    write_csv(report, folder, "fragility.csv", header, found.levels, found.lower, found.upper)
+    write_table(report, folder, "fragility.csv", header, found.levels, found.lower, found.upper)
     columns = found.table()
     with folder.whole("stripes.csv") as aside, aside.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)

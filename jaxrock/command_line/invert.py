@@ -10,11 +10,11 @@ import numpy as np
 
 import jaxrock as rk
 from jaxrock.command_line.command import Command
-from jaxrock.command_line.options import check_points, check_range, extent_of, model_of, number, other_parameters
+from jaxrock.command_line.options import check_points, check_range, extent_of, model_of, other_parameters, plain_float
 from jaxrock.command_line.output import Report, plain
 from jaxrock.command_line.results import ResultFolder
 from jaxrock.inverse.observation_files import EXAMPLE
-from jaxrock.inverse.observations import SEEN, TOPPLED
+from jaxrock.inverse.observations import SEEN, SEEN_TOPPLED
 from jaxrock.motions.pulses import PULSES, UNITS
 
 _FILES, _WALL = ("estimate.csv", "probabilities.csv", "region.csv", "region.png"), "unexceeded.csv"
@@ -53,7 +53,7 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
         "and radius2_m or p1_rad_per_s and p2_rad_per_s; inertia_ratio; facing. Standard deviations: alpha_deg_sd etc.",
     )
     parser.add_argument("--pulse", choices=tuple(PULSES), default="sine", help="kind of motion (default sine)")
-    ends: dict[str, Any] = {"type": number, "nargs": 2, "metavar": ("FROM", "TO")}
+    ends: dict[str, Any] = {"type": plain_float, "nargs": 2, "metavar": ("FROM", "TO")}
     parser.add_argument("--amplitude", default=(0.02, 3.0), help="range of the amplitude [g] (default 0.02 3)", **ends)
     parser.add_argument(
         "--duration", default=(0.1, 5.0), help="range of duration or period [s] (default 0.1 5)", **ends
@@ -64,11 +64,14 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
         shown = "" if known is None else f" (default {known[0]:g} {known[1]:g})"
         parser.add_argument(f"--{name}", help=f"range of the {name} of the pulse {words}{shown}", **ends)
     parser.add_argument(
-        "--scatter", type=number, default=0.3, help="standard deviation of ln amplitude from rock to rock (default 0.3)"
+        "--scatter",
+        type=plain_float,
+        default=0.3,
+        help="standard deviation of ln amplitude from rock to rock (default 0.3)",
     )
     parser.add_argument(
         "--lapse",
-        type=number,
+        type=plain_float,
         default=0.02,
         help="probability that what was seen of a rock says nothing: moved, misjudged (default 0.02)",
     )
@@ -106,7 +109,7 @@ def _run(arguments: argparse.Namespace, report: Report) -> None:
     likelihood = rk.inverse.Likelihood(observations, pulse, scatter, model, lapse=lapse)
     region = rk.inverse.feasible_region(likelihood, axes, fixed)
     wall = None
-    if np.any(np.asarray(observations.seen) != TOPPLED):
+    if np.any(np.asarray(observations.seen) != SEEN_TOPPLED):
         wall = rk.inverse.unexceeded_motion(observations, lambda a, t: pulse(a, t, **fixed), axes[extent], model=model)
     files = _write(arguments.out, observations, estimate, region, wall)
     report.say(_text(observations, estimate, ", with the priors" if priors else ""))
@@ -155,7 +158,7 @@ def _priors(given: list[list[str]], pulse: str) -> dict[str, tuple[float, float]
         if name in priors:
             raise ValueError(f"Argument `--prior` must name {name} at most once, but does so twice.")
         try:
-            median, deviation = number(numbers[0]), number(numbers[1])
+            median, deviation = plain_float(numbers[0]), plain_float(numbers[1])
         except ValueError:
             said = f"{name} {' '.join(numbers)}"
             raise ValueError(f"Argument `--prior` must end with two numbers, but is {said}.") from None

@@ -18,10 +18,10 @@ from jaxrock.command_line.map import MAP
 from jaxrock.command_line.options import as_typed, inputs_of
 from jaxrock.command_line.output import Report, complain, drop, heard
 from jaxrock.command_line.parser import Parser
-from jaxrock.command_line.results import KNOWN, ResultFolder
+from jaxrock.command_line.results import HASH_FILE, ResultFolder
 from jaxrock.command_line.run import RUN
 from jaxrock.command_line.spectrum import SPECTRUM
-from jaxrock.keeping.compiled import keep_compiled
+from jaxrock.compiler import cache
 from jaxrock.sweeps.devices import use_cpu_devices
 
 # To add a command, write a module like `run` and add it here.
@@ -40,7 +40,7 @@ _EXAMPLES = """\
   jaxrock cache --clear                           forget what was compiled before
 """
 _RESULTS = f"""\
-The next run replaces results in --out that jaxrock wrote and that are unchanged; {KNOWN} lists them.
+The next run replaces results in --out that jaxrock wrote and that are unchanged; {HASH_FILE} lists them.
 It replaces other files, and inputs, with --force only."""
 _EXIT = "exit status: 0 good, 1 something was not computed, 2 bad input, 130 interrupted, 141 nobody reads it any more"
 
@@ -145,7 +145,7 @@ def _prepare(command: Command, arguments: argparse.Namespace) -> None:
         raise PermissionError(f"Argument `--out` must be a folder that can be written, but {arguments.out} is not.")
     arguments.out = ResultFolder(arguments.out, inputs_of(arguments), arguments.force)
     arguments.out.check(command.writes(arguments))
-    keep_compiled()
+    cache.keep_compiled()
     jax.config.update("jax_enable_x64", True)
     import matplotlib
 

@@ -12,10 +12,10 @@ from jaxrock.command_line.options import (
     check_points,
     check_range,
     model_of,
-    number,
+    plain_float,
     pulse_of,
 )
-from jaxrock.command_line.output import Entry, Report, check_surface, save, write_csv
+from jaxrock.command_line.output import Entry, Report, check_surface, save, write_table
 
 # Horizontal and vertical axes: whether they are those of single-lobe pulses, the default range, and the meaning.
 _AXES = {
@@ -32,10 +32,12 @@ _AXES = {
 
 def _add_options(parser: argparse.ArgumentParser) -> None:
     add_restitution(parser)
-    parser.add_argument("--alpha", type=number, default=0.2, help="slenderness angle [rad] (default 0.2)")
+    parser.add_argument("--alpha", type=plain_float, default=0.2, help="slenderness angle [rad] (default 0.2)")
     for name, (_, ends, meaning) in _AXES.items():
         words = f"{meaning} (default {ends[0]:g} {ends[1]:g})"
-        parser.add_argument("--" + name.replace("_", "-"), type=number, nargs=2, metavar=("FROM", "TO"), help=words)
+        parser.add_argument(
+            "--" + name.replace("_", "-"), type=plain_float, nargs=2, metavar=("FROM", "TO"), help=words
+        )
     parser.add_argument("--points", type=int, default=128, help="points along each axis (default 128)")
     parser.add_argument("--pixels", action="store_true", help="draw the points' verdicts alone, not the exact borders")
     add_pulse(parser)
@@ -56,7 +58,7 @@ def _run(arguments: argparse.Namespace, report: Report) -> None:
     counts = {name: int((state == key).sum()) for key, name in names.items()}
     report.table([Entry(name.replace(" ", "_"), name, count, unit="scenes") for name, count in counts.items()])
     columns, rows = np.meshgrid(*axes.values())
-    write_csv(report, arguments.out, "map.csv", ",".join(axes) + ",state,max_rotation_over_alpha,impacts,margin",
+    write_table(report, arguments.out, "map.csv", ",".join(axes) + ",state,max_rotation_over_alpha,impacts,margin",
               *(np.ravel(x) for x in (columns, rows, state, result.max_rotation, result.impact_count, result.margin)),
               )  # fmt: skip
     exact = False if arguments.pixels else None

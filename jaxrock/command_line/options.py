@@ -14,11 +14,14 @@ from jaxrock.motions.pulses import PULSES
 from jaxrock.motions.pulses.pulse import AbstractPulse
 
 
-def number(text: str) -> float:
+def plain_float(text: str) -> float:
     """Parse the number of an option; unlike `float`, refuse underscores between digits."""
     if "_" in text:
         raise ValueError
     return float(text)
+
+
+plain_float.__name__ = "number"  # in messages of argparse
 
 
 def model_of(arguments: argparse.Namespace) -> rk.models.AbstractEquation:
@@ -28,7 +31,9 @@ def model_of(arguments: argparse.Namespace) -> rk.models.AbstractEquation:
 
 def add_restitution(parser: argparse.ArgumentParser) -> None:
     """Add the option of the block's restitution."""
-    parser.add_argument("--restitution", type=number, help="angular velocity after/before impact (default: Housner's)")
+    parser.add_argument(
+        "--restitution", type=plain_float, help="angular velocity after/before impact (default: Housner's)"
+    )
 
 
 def add_record(parser: argparse.ArgumentParser) -> None:
@@ -39,7 +44,7 @@ def add_record(parser: argparse.ArgumentParser) -> None:
         help="PEER AT2, CSMIP V1 or V2, COSMOS, ESM, SMC, K-NET, CSV or text file (default: the built-in record)",
     )
     add_description(parser)
-    parser.add_argument("--scale", type=number, default=1.0, help="factor on the acceleration (default 1)")
+    parser.add_argument("--scale", type=plain_float, default=1.0, help="factor on the acceleration (default 1)")
 
 
 def files_of(words: list[str]) -> list[str]:
@@ -52,7 +57,7 @@ def files_of(words: list[str]) -> list[str]:
 
 def add_description(parser: argparse.ArgumentParser) -> None:
     """Add options for files that lack time step, unit or column."""
-    parser.add_argument("--dt", type=number, help="time between samples [s], for files that do not say")
+    parser.add_argument("--dt", type=plain_float, help="time between samples [s], for files that do not say")
     parser.add_argument("--unit", help="g, m/s2 or cm/s2, for files that do not say")
     parser.add_argument("--column", type=int, help="column of a CSV, or channel of a V1 or V2 file, from 0")
 
@@ -94,7 +99,7 @@ def add_pulse(parser: argparse.ArgumentParser) -> None:
             default = 0.0 if default is Parameter.empty else default
             shown = default if isinstance(default, str) else "its own" if default is None else f"{default:g}"
             meant.setdefault(name, []).append(f"{word} (default {shown})")
-            kinds[name] = str if isinstance(default, str) else number
+            kinds[name] = str if isinstance(default, str) else plain_float
     for name, words in meant.items():
         parser.add_argument(option_of(name), type=kinds[name], help=f"of the pulse {', '.join(words)}")
 

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple, TextIO
 import numpy as np
 
 import jaxrock as rk
-from jaxrock._tables import items_of
+from jaxrock._arguments.tables import items_of
 from jaxrock.command_line.results import ResultFolder
 
 
@@ -135,7 +135,7 @@ def plain(value: Any) -> Any:
     return value.item() if value.dtype.kind != "f" else float(value) if np.isfinite(value) else None
 
 
-def write_csv(report: Report, folder: ResultFolder, name: str, header: str, *columns) -> None:
+def write_table(report: Report, folder: ResultFolder, name: str, header: str, *columns) -> None:
     """Write columns of numbers under a comma-separated header."""
     table = np.column_stack([np.asarray(column, dtype=float) for column in columns])
     with folder.whole(name) as aside:

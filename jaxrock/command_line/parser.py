@@ -4,7 +4,7 @@ import argparse
 import re
 from typing import NoReturn
 
-from jaxrock._words import meant
+from jaxrock._core.did_you_mean import did_you_mean
 
 
 class Parser(argparse.ArgumentParser):
@@ -15,9 +15,9 @@ class Parser(argparse.ArgumentParser):
         option = re.search(r"unrecognized arguments: (--[^\s=]+)", message)
         hint = ""
         if choice:
-            hint = meant(choice[1], re.findall(r"[\w-]+", choice[2]))
+            hint = did_you_mean(choice[1], re.findall(r"[\w-]+", choice[2]))
         elif option:
-            hint = meant(option[1], [word for word in self._option_string_actions if word.startswith("--")])
+            hint = did_you_mean(option[1], [word for word in self._option_string_actions if word.startswith("--")])
         super().error(f"{message}.{hint}" if hint else message)
 
     def parse_args(self, args=None, namespace=None):  # type: ignore[override]  # of overloads

@@ -13,9 +13,9 @@ import tempfile
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
-from jaxrock._aside import move_into_place
+from jaxrock._core.atomic_files import move_into_place
 
-KNOWN = ".jaxrock.sha256"
+HASH_FILE = ".jaxrock.sha256"
 _TITLE = "# Files that jaxrock wrote here, by their SHA-256: these it replaces, all others with --force only."
 
 
@@ -37,7 +37,7 @@ class ResultFolder:
         """
         found = [f"{self.path / name} {risk}" for name in names if (risk := self._risk(self.path / name))]
         if not self._is_list_own():
-            found.append(f"{self.path / KNOWN} is not jaxrock's")
+            found.append(f"{self.path / HASH_FILE} is not jaxrock's")
         if found:
             raise FileExistsError(
                 f"Argument `--out` must be a folder whose files may be replaced, but {'; '.join(found)}. Give another "
@@ -90,11 +90,11 @@ class ResultFolder:
         return f"{_digest(path)}  {path.name}" in self._told().splitlines()
 
     def _is_list_own(self) -> bool:
-        known = self.path / KNOWN
+        known = self.path / HASH_FILE
         return not os.path.lexists(known) or not known.is_symlink() and self._told().startswith(_TITLE)
 
     def _told(self) -> str:
-        known = self.path / KNOWN
+        known = self.path / HASH_FILE
         return known.read_text(encoding="utf-8", errors="replace") if known.is_file() else ""
 
     def _note(self, name: str, digest: str) -> None:
@@ -103,7 +103,7 @@ class ResultFolder:
         if line in told.splitlines():
             return
         start = "" if told.endswith("\n") else "\n" if told else f"{_TITLE}\n"  # a full disk may have cut the last line
-        with open(self.path / KNOWN, "a", encoding="utf-8", opener=_opened) as file:
+        with open(self.path / HASH_FILE, "a", encoding="utf-8", opener=_opened) as file:
             file.write(f"{start}{line}\n")
 
 

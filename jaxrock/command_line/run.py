@@ -6,19 +6,19 @@ import numpy as np
 
 import jaxrock as rk
 from jaxrock.command_line.command import Command
-from jaxrock.command_line.options import add_record, add_restitution, model_of, number, record_of
-from jaxrock.command_line.output import Entry, Report, save, write_csv
+from jaxrock.command_line.options import add_record, add_restitution, model_of, plain_float, record_of
+from jaxrock.command_line.output import Entry, Report, save, write_table
 from jaxrock.command_line.results import ResultFolder
 
 _FILMS = ("gif", "html", "mp4")
 
 
 def _add_options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--width", type=number, default=0.6, help="full width [m] (default 0.6)")
-    parser.add_argument("--height", type=number, default=3.0, help="full height [m] (default 3)")
+    parser.add_argument("--width", type=plain_float, default=0.6, help="full width [m] (default 0.6)")
+    parser.add_argument("--height", type=plain_float, default=3.0, help="full height [m] (default 3)")
     parser.add_argument(
         "--duration",
-        type=number,
+        type=plain_float,
         help="of the history that is drawn and written [s] (default: a little past the record); the table is of the "
         "whole motion and of what follows",
     )
@@ -94,9 +94,9 @@ def _write(report: Report, folder: ResultFolder, response: rk.responses.Response
     """Write files and figures of the response."""
     for ending in _FILMS:
         folder.discard(_film_of(ending))  # a film of an earlier run may show another block
-    write_csv(report, folder, "history.csv", "time_s,rotation_rad,velocity_rad_per_s", response.time,
+    write_table(report, folder, "history.csv", "time_s,rotation_rad,velocity_rad_per_s", response.time,
               response.rotation, response.velocity)  # fmt: skip
-    write_csv(report, folder, "impacts.csv", "time_s,velocity_before_rad_per_s", response.impact_times,
+    write_table(report, folder, "impacts.csv", "time_s,velocity_before_rad_per_s", response.impact_times,
               response.impact_velocities)  # fmt: skip
     save(report, folder, "history.png", rk.plot.history(response)[0].figure)
     save(report, folder, "phase.png", rk.plot.phase(response).figure)

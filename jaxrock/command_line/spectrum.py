@@ -12,16 +12,16 @@ from jaxrock.command_line.options import (
     check_points,
     check_range,
     model_of,
-    number,
+    plain_float,
     record_of,
 )
-from jaxrock.command_line.output import Entry, Report, check_surface, save, write_csv
+from jaxrock.command_line.output import Entry, Report, check_surface, save, write_table
 
 
 def _add_options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--slenderness", type=number, default=5.0, help="height/width of the blocks (default 5)")
-    parser.add_argument("--shortest", type=number, default=0.5, help="shortest 2 pi/p [s] (default 0.5)")
-    parser.add_argument("--longest", type=number, default=8.0, help="longest 2 pi/p [s] (default 8)")
+    parser.add_argument("--slenderness", type=plain_float, default=5.0, help="height/width of the blocks (default 5)")
+    parser.add_argument("--shortest", type=plain_float, default=0.5, help="shortest 2 pi/p [s] (default 0.5)")
+    parser.add_argument("--longest", type=plain_float, default=8.0, help="longest 2 pi/p [s] (default 8)")
     parser.add_argument("--points", type=int, default=200, help="number of block sizes (default 200)")
     add_restitution(parser)
     add_record(parser)
@@ -50,7 +50,7 @@ def _run(arguments: argparse.Namespace, report: Report) -> None:
     header = "two_pi_over_p_s,max_rotation_over_alpha,max_velocity_over_p_alpha,impacts,overturned,margin"
     peaks = (result.max_rotation, result.max_velocity, result.impact_count, lost, result.margin)
     columns = [np.where(known, np.asarray(each, float), np.nan) for each in peaks]  # NaN marks what is not a result
-    write_csv(report, arguments.out, "spectrum.csv", header, period, *columns)
+    write_table(report, arguments.out, "spectrum.csv", header, period, *columns)
     save(report, arguments.out, "spectrum.png", rk.plot.spectrum(result)[0].figure)
     check_surface(report, result.status)
 

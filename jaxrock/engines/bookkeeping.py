@@ -3,24 +3,19 @@
 from dataclasses import replace
 
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Inexact
 
+from jaxrock._core.types import Flag, Scalar
+from jaxrock.compiler.hints import materialize, select, stop_gradient
 from jaxrock.engines.state import State, surpasses
 from jaxrock.engines.stepper import AbstractStepper
-from jaxrock.engines.uncertainty import GRAZING, Spread
+from jaxrock.engines.uncertainty import GRAZING, StateCovariance
 from jaxrock.models.equation import Angle
-from jaxrock.numerics.choice import where
-from jaxrock.numerics.fixed import fixed
-from jaxrock.numerics.xla_cpu import keep
 from jaxrock.status import Status
-
-Scalar = Inexact[Array, ""]
-Flag = Bool[Array, ""]
 
 MOST_OFF = 1e-2  # standard error over the saddle's angle beyond which a state is meaningless
 
 
-def checked(stepper: AbstractStepper, before: State, after: State) -> State:
+def checked_step(stepper: AbstractStepper, before: State, after: State) -> State:
     """Count the step. Stop where the state is not finite, and set the status where its error is too large."""
     good = jnp.isfinite(after.opening) & jnp.isfinite(after.velocity) & jnp.isfinite(after.local)
     lost = (after.side != 0) & ~(after.spread.square <= (MOST_OFF * stepper.scene.moments.saddle) ** 2)
@@ -47,21 +42,21 @@ def escaped(stepper: AbstractStepper, state: State, angle: Angle) -> Flag:
     ceiling, weight = stepper.scene.outlook.most_helpful(state.piece)
     hold = moments.held(angle, state.velocity, ceiling, weight)
     forced = angle, hold, ceiling, weight
-    needed = where(hold > 0, moments.held_manifold(*forced), moments.unheld_manifold(*forced))
+    needed = select(hold > 0, moments.held_manifold(*forced), moments.unheld_manifold(*forced))
     certain = state.velocity - needed > stepper.doubt * state.spread.error_of(1.0, 1.0)
     return state.beyond & (state.velocity >= 0) & certain
 
 
 def errors_after(
     stepper: AbstractStepper, state: State, angle: Angle, ground: tuple, elapsed: Scalar, step: tuple
-) -> Spread:
+) -> StateCovariance:
     """Return the errors after `elapsed` seconds of rocking, rounding included.
 
     `ground`: acceleration [g] and weight (`Shaking.at`); `step`: errors of angle and velocity [rad] that the engine's
     own approximation adds.
     """
     given = stepper, state, angle, ground, elapsed, step
-    stepper, state, angle, (acceleration, weight), elapsed, step = fixed(given)
+    stepper, state, angle, (acceleration, weight), elapsed, step = stop_gradient(given)
     push = state.side * acceleration
     moments, time = stepper.scene.moments, stepper.scene.p * elapsed  # an error has no derivative
     of_angle, of_velocity = rounded(stepper, state, jnp.abs(push), time)
@@ -80,43 +75,45 @@ def rounded(stepper: AbstractStepper, state: State, push: Scalar, time: Scalar) 
     return of_angle, eps * speed + pull * (time + clock)
 
 
-def note(stepper: AbstractStepper, state: State, outward, turning, crossing, opening, speed, acceleration) -> State:
+def record_extrema(
+    stepper: AbstractStepper, state: State, outward, turning, crossing, opening, speed, acceleration
+) -> State:
     """Update peaks, clearances and the closeness to standing still in balance (see `Outcome.margin`)."""
     moments = stepper.scene.moments
     # Take the larger acceleration, with or without the shaking. A block that the ground holds for an instant, far from
     # its saddle, is not in balance.
     pull = jnp.maximum(jnp.abs(acceleration), jnp.abs(moments.restoring(Angle.of(opening))))
     per_rest = 1 / moments.restoring_at_rest**2  # `keep` below has XLA compute the product once
-    stillness = keep((moments.stiffness * speed**2 + pull**2) * per_rest, state.local)
+    stillness = materialize((moments.stiffness * speed**2 + pull**2) * per_rest, state.local)
     turn = turning & (outward | state.beyond)
-    closeness = where(turn, jnp.minimum(state.closeness, stillness), state.closeness)
-    closeness = where(crossing, jnp.minimum(closeness, stillness), closeness)
-    beyond = where(crossing, where(state.beyond, stillness, jnp.inf), state.closeness_beyond)
-    beyond = where(turning & state.beyond, jnp.minimum(beyond, stillness), beyond)
+    closeness = select(turn, jnp.minimum(state.closeness, stillness), state.closeness)
+    closeness = select(crossing, jnp.minimum(closeness, stillness), closeness)
+    beyond = select(crossing, select(state.beyond, stillness, jnp.inf), state.closeness_beyond)
+    beyond = select(turning & state.beyond, jnp.minimum(beyond, stillness), beyond)
     higher = turning & outward
     first = higher & surpasses(opening, state.peak)
     # A turn back just above the ground, within the error of the angle, may have been an impact.
     angle = state.spread.angle
     off = jnp.abs(opening) + angle
     grazing = turning & ~outward & (off <= GRAZING * angle)
-    graze = where(grazing, 8 * jnp.abs(acceleration) * off, 0.0)
+    graze = select(grazing, 8 * jnp.abs(acceleration) * off, 0.0)
     # Standing still in balance, within the error of the state in the direction in which it leaves.
     balanced = (turning | crossing) & (speed**2 + pull**2 <= stepper.doubt**2 * state.spread.variance(1.0, 1.0))
     if stepper.scene.falls_flat:
         balanced = balanced | (higher & (jnp.abs(opening - jnp.pi / 2) <= stepper.doubt * angle))
     undecided = balanced & (state.status == Status.successful)
     highest = higher & (opening > state.peak)
-    clearance = where(turning & ~outward, jnp.minimum(state.clearance, opening), state.clearance)
+    clearance = select(turning & ~outward, jnp.minimum(state.clearance, opening), state.clearance)
     return replace(
         state,
-        peak=where(highest, opening, state.peak),
-        second=where(higher, jnp.maximum(state.second, jnp.minimum(opening, state.peak)), state.second),
+        peak=select(highest, opening, state.peak),
+        second=select(higher, jnp.maximum(state.second, jnp.minimum(opening, state.peak)), state.second),
         clearance=clearance,
-        peak_clearance=where(highest, clearance, state.peak_clearance),
-        peak_time=where(first, stepper.time(state), state.peak_time),
-        error=where(first, fixed(angle), state.error),
+        peak_clearance=select(highest, clearance, state.peak_clearance),
+        peak_time=select(first, stepper.time(state), state.peak_time),
+        error=select(first, stop_gradient(angle), state.error),
         closeness=closeness,
         closeness_beyond=beyond,
-        spread=fixed(state.spread.plus_variance(0.0, graze)),
+        spread=stop_gradient(state.spread.plus_variance(0.0, graze)),
         status=Status.where(undecided, Status.undecided, state.status),
     )

@@ -5,13 +5,10 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Inexact
 
+from jaxrock._core.types import Scalar
+from jaxrock.compiler.hints import select
 from jaxrock.engines.scene import Scene
-from jaxrock.numerics.choice import where
-
-Scalar = Inexact[Array, ""]
-Flag = Bool[Array, ""]
 
 
 class Events(NamedTuple):
@@ -45,11 +42,11 @@ WATCHED = Events(
 
 def level_of(scene: Scene, hits: Events) -> Scalar:
     """Return the opening angle at which a step ends, if an event sets it."""
-    return where(hits.saddle, scene.moments.saddle, where(hits.flat, jnp.pi / 2, 0.0))
+    return select(hits.saddle, scene.moments.saddle, select(hits.flat, jnp.pi / 2, 0.0))
 
 
 def landed(scene: Scene, hits: Events, opening: Scalar, velocity: Scalar) -> tuple[Scalar, Scalar]:
     """Return opening angle and velocity at the end of a step, exact where its event sets them. At an impact, `impact`
     sets them."""
-    opening = where(hits.flat, jnp.pi / 2, where(hits.saddle, scene.moments.saddle, opening))
-    return opening, where(hits.turning, 0.0, velocity)
+    opening = select(hits.flat, jnp.pi / 2, select(hits.saddle, scene.moments.saddle, opening))
+    return opening, select(hits.turning, 0.0, velocity)

@@ -12,18 +12,16 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Inexact, Int
+from jaxtyping import Array, Bool, Int
 
+from jaxrock._core.types import Flag, Scalar
 from jaxrock.blocks.restitution import Reset
+from jaxrock.compiler import MacroPrimitive
+from jaxrock.compiler.hints import select
 from jaxrock.engines.state import surpasses
 from jaxrock.models import free_swing as skewed
 from jaxrock.models.coefficients import Coefficients
 from jaxrock.models.equation import Angle
-from jaxrock.numerics.choice import where
-from jaxrock.numerics.compound import Compound
-
-Scalar = Inexact[Array, ""]
-Flag = Bool[Array, ""]
 
 
 class FreeStage(eqx.Module):
@@ -79,7 +77,7 @@ def _carlson_rf_written(x, y, z):
     return [(1 - e2 / 10 + e3 / 14 + e2 * e2 / 24 - 3 * e2 * e3 / 44) / jnp.sqrt(mean)]
 
 
-_carlson_rf = Compound("carlson_rf", _carlson_rf_written)
+_carlson_rf = MacroPrimitive("carlson_rf", _carlson_rf_written)
 
 
 def _time_to_peak(moments: Coefficients, gap: Scalar, manifold: Scalar, speed: Scalar) -> Scalar:
@@ -157,7 +155,7 @@ def free_stage(
         rebound = ratio * arrival
         share = share * jnp.abs(ratio * reset.slope(arrival))  # share of a change of the energy
         stay = _after_impact(visit.moments, rebound, happens, falls_flat)
-        lost, impacts = lost | stay.lost, where(stay.lost, i, impacts)
+        lost, impacts = lost | stay.lost, select(stay.lost, i, impacts)
         arrival = rebound
         found.append(stay)
         shares.append(share)
@@ -170,23 +168,23 @@ def free_stage(
     for stay, share in zip(found, shares):
         higher = stay.safe & surpasses(stay.peak, peak)
         highest.append(stay.safe & surpasses(stay.peak, best))
-        best = where(highest[-1], stay.peak, best)
-        steepness = where(higher, stay.steepness, steepness)
-        peak_share = where(higher, share, peak_share)
-        peak = where(stay.safe & (stay.peak > peak), stay.peak, peak)
-        fastest = where(stay.safe, jnp.maximum(fastest, stay.arrival), fastest)
-        closeness = where(stay.lost, stay.closeness, jnp.minimum(closeness, stay.closeness))
+        best = select(highest[-1], stay.peak, best)
+        steepness = select(higher, stay.steepness, steepness)
+        peak_share = select(higher, share, peak_share)
+        peak = select(stay.safe & (stay.peak > peak), stay.peak, peak)
+        fastest = select(stay.safe, jnp.maximum(fastest, stay.arrival), fastest)
+        closeness = select(stay.lost, stay.closeness, jnp.minimum(closeness, stay.closeness))
         # Compare the deficits in terms of the present energy.
-        missing = jnp.abs(stay.deficit) / where(share > 0, share, 1.0)
+        missing = jnp.abs(stay.deficit) / select(share > 0, share, 1.0)
         narrow = stay.decides & (missing < narrowest)
-        deficit, decisive = where(narrow, stay.deficit, deficit), where(narrow, share, decisive)
-        narrowest = where(narrow, missing, narrowest)
+        deficit, decisive = select(narrow, stay.deficit, deficit), select(narrow, share, decisive)
+        narrowest = select(narrow, missing, narrowest)
 
     def time():
         at = since = zero
         for stay, higher in zip(found, highest):
             top, since = stay.times(since)
-            at = where(higher, top, at)
+            at = select(higher, top, at)
         return at
 
     # Elliptic integrals cost more than all the rest, and most peaks come before the free stage.
@@ -194,11 +192,11 @@ def free_stage(
     return FreeStage(
         overturned=lost,
         impacts=impacts.astype(jnp.int32),
-        peak=where(lost, 0.0, peak),
+        peak=select(lost, 0.0, peak),
         peak_time=peak_time,
         peak_steepness=steepness,
         peak_share=peak_share,
-        fastest=where(lost, 0.0, fastest),
+        fastest=select(lost, 0.0, fastest),
         closeness=closeness,
         deficit=deficit,
         share=decisive,
@@ -255,7 +253,7 @@ def _flat(moments: Coefficients, falls_flat: bool) -> tuple[Scalar | float, Flag
         return 0.0, False
     saddle = moments.saddle
     level = moments.manifold(jnp.full_like(saddle, jnp.pi / 2)) ** 2 / moments.stiffness
-    return where(saddle > jnp.pi / 2, level, 0.0), saddle > jnp.pi / 2
+    return select(saddle > jnp.pi / 2, level, 0.0), saddle > jnp.pi / 2
 
 
 def _present(
@@ -275,34 +273,34 @@ def _present(
     rises, falls = safe & outward, safe & ~outward
 
     def times(_):
-        out = _time_to_peak(moments, gap, where(rises, manifold, base), where(rises, speed, 0.0))
-        back = _time_to_peak(moments, moments.saddle, base, where(rises, arrival, 0.0)) if comes_back else jnp.inf
+        out = _time_to_peak(moments, gap, select(rises, manifold, base), select(rises, speed, 0.0))
+        back = _time_to_peak(moments, moments.saddle, base, select(rises, arrival, 0.0)) if comes_back else jnp.inf
         falling = _time_to_impact(
             moments,
-            where(falls, gap, moments.saddle),
-            where(falls, manifold, base),
-            where(falls, -speed, 0.0),
+            select(falls, gap, moments.saddle),
+            select(falls, manifold, base),
+            select(falls, -speed, 0.0),
             base,
-            where(falls, arrival, 0.0),
+            select(falls, arrival, 0.0),
         )
-        return out / rate, where(outward, out + back, falling) / rate
+        return out / rate, select(outward, out + back, falling) / rate
 
     # Closeness: crossing the saddle at a speed, or turning at an acceleration.
     crossing, turning = -deficit * _weight(moments), _turning_closeness(moments, jnp.abs(deficit))
     past_inward = (gap < 0) & (speed < 0)
-    beyond = where(past_inward, _turning_closeness(moments, jnp.abs(deficit), beyond=True), jnp.inf)
-    lost_closeness = where(gap > 0, crossing, beyond)
-    safe_closeness = where(outward, turning, where(past_inward, crossing, jnp.inf))
-    peak = _peak_of(moments, where(rises, deficit, base**2))
-    lost_closeness = where(flat, jnp.inf, lost_closeness)
+    beyond = select(past_inward, _turning_closeness(moments, jnp.abs(deficit), beyond=True), jnp.inf)
+    lost_closeness = select(gap > 0, crossing, beyond)
+    safe_closeness = select(outward, turning, select(past_inward, crossing, jnp.inf))
+    peak = _peak_of(moments, select(rises, deficit, base**2))
+    lost_closeness = select(flat, jnp.inf, lost_closeness)
     return _Stay(
         lost=lost,
         safe=safe,
         decides=moving & (outward | past_inward),
         deficit=(deficit - level) * moments.stiffness,
-        peak=where(rises, peak, 0.0),
+        peak=select(rises, peak, 0.0),
         steepness=_steepness(moments, peak),
-        closeness=where(lost, lost_closeness, where(safe, safe_closeness, jnp.inf)),
+        closeness=select(lost, lost_closeness, select(safe, safe_closeness, jnp.inf)),
         arrival=arrival * rate,
         times=times,
     )
@@ -318,12 +316,12 @@ def _after_impact(moments: Coefficients, rebound: Scalar, happens: Flag, falls_f
     safe = happens & ~lost
 
     def times(since):
-        out = _time_to_peak(moments, moments.saddle, base, where(safe, speed, 0.0)) / rate
+        out = _time_to_peak(moments, moments.saddle, base, select(safe, speed, 0.0)) / rate
         return since + out, since + 2 * out
 
-    peak = _peak_of(moments, where(safe, deficit, base**2))
+    peak = _peak_of(moments, select(safe, deficit, base**2))
     turning = _turning_closeness(moments, jnp.abs(deficit))
-    crossing = where(flat, jnp.inf, -deficit * _weight(moments))
+    crossing = select(flat, jnp.inf, -deficit * _weight(moments))
     return _Stay(
         lost=lost,
         safe=safe,
@@ -331,7 +329,7 @@ def _after_impact(moments: Coefficients, rebound: Scalar, happens: Flag, falls_f
         deficit=(deficit - level) * moments.stiffness,
         peak=peak,
         steepness=_steepness(moments, peak),
-        closeness=where(lost, crossing, where(safe, turning, jnp.inf)),
+        closeness=select(lost, crossing, select(safe, turning, jnp.inf)),
         arrival=rebound,
         times=times,
     )

@@ -18,19 +18,15 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Inexact, Int
+from jaxtyping import Array, Int
 
+from jaxrock._core.types import Flag, Scalar
+from jaxrock.compiler.hints import materialize_flag, select, stop_gradient
 from jaxrock.engines.state import State
 from jaxrock.engines.stepper import AbstractStepper
-from jaxrock.engines.uncertainty import Spread
+from jaxrock.engines.uncertainty import StateCovariance
 from jaxrock.models.equation import Angle
-from jaxrock.numerics.choice import where
 from jaxrock.numerics.elementary import logarithm
-from jaxrock.numerics.fixed import fixed
-from jaxrock.numerics.xla_cpu import keep_flag
-
-Scalar = Inexact[Array, ""]
-Flag = Bool[Array, ""]
 
 
 class _Rebound(NamedTuple):
@@ -39,7 +35,7 @@ class _Rebound(NamedTuple):
     speed: Scalar  # outward, after the impact
     here: Scalar  # decelerations on its side,
     there: Scalar  # and on the side from which it came
-    spread: Spread
+    spread: StateCovariance
 
 
 def impact(
@@ -53,23 +49,25 @@ def impact(
     rebound = _rebound(stepper, state, speed, ground)
     slowed = hit & (rebound.there < 0)  # by the forcing, before the impact: otherwise it would have turned back
     depth = jax.lax.cond(
-        slowed, lambda: speed**2 / (2 * where(slowed, -rebound.there, 1.0)), lambda: jnp.zeros_like(speed)
+        slowed, lambda: speed**2 / (2 * select(slowed, -rebound.there, 1.0)), lambda: jnp.zeros_like(speed)
     )
     rests, more, wait = _rests_if_soon(stepper, state, hit, rebound, steepest, reach)
     fastest = state.fastest
     if stepper.scene.far is not None:  # with unequal corners the rebound may be faster than the approach
-        fastest = where(hit & (rebound.speed > fastest), rebound.speed, fastest)
+        fastest = select(hit & (rebound.speed > fastest), rebound.speed, fastest)
     return replace(
         state,
         impacts=state.impacts + (hit & (speed < 0)) + more,
-        impact_time=where(hit, stepper.time(state), state.impact_time),
-        impact_velocity=where(hit, state.side * speed, state.impact_velocity),
-        side=where(rests, 0.0, where(hit, -state.side, state.side)),
-        clearance=where(slowed, jnp.minimum(state.clearance, depth), state.clearance),
+        impact_time=select(hit, stepper.time(state), state.impact_time),
+        impact_velocity=select(hit, state.side * speed, state.impact_velocity),
+        side=select(rests, 0.0, select(hit, -state.side, state.side)),
+        clearance=select(slowed, jnp.minimum(state.clearance, depth), state.clearance),
         fastest=fastest,
-        opening=where(hit, 0.0, state.opening),
-        velocity=where(rests, 0.0, where(hit, rebound.speed, state.velocity)),
-        spread=Spread.where(rests, Spread.none(speed), Spread.where(hit, rebound.spread, state.spread)),
+        opening=select(hit, 0.0, state.opening),
+        velocity=select(rests, 0.0, select(hit, rebound.speed, state.velocity)),
+        spread=StateCovariance.where(
+            rests, StateCovariance.none(speed), StateCovariance.where(hit, rebound.spread, state.spread)
+        ),
         local=state.local + wait,
         beyond=state.beyond & ~hit,
         uplifting=state.uplifting & ~hit,
@@ -86,7 +84,7 @@ def _rebound(stepper: AbstractStepper, state: State, speed: Scalar, ground: tupl
     here = -ahead.acceleration(rest, rebound, side * ground[0], ground[1])
     there = -moments.acceleration(rest, speed, state.side * ground[0], ground[1])
     spread = state.spread.after_impact(speed, -there, -here, ratio, scene.reset.slope(before))
-    return _Rebound(rebound, here, there, fixed(spread))
+    return _Rebound(rebound, here, there, stop_gradient(spread))
 
 
 def _rests_if_soon(
@@ -94,7 +92,7 @@ def _rests_if_soon(
 ) -> tuple[Flag, Int[Array, ""], Scalar]:
     """Call `_rests` only where the next hop is short enough for it."""
     given = stepper, state, hit, after, steepest, reach
-    stepper, state, hit, after, steepest, reach = fixed(given)
+    stepper, state, hit, after, steepest, reach = stop_gradient(given)
     # Zero speed counts as soon, unless the ground throws the block on at once; then it moves on as from any speed.
     soon = hit & (8 * after.speed <= reach * stepper.scene.p * after.here)
 
@@ -112,8 +110,8 @@ def _rests(
     e, back = scene.reset.most(rebound), scene.far_reset.most(rebound)
     weaker = jnp.minimum(after.here, after.there)
     held = (weaker > 0) & (e * back < 1)
-    here, there = where(held, after.here, 1.0), where(held, after.there, 1.0)
-    remaining = 2 * rebound * (1 / here + back / there) / where(held, 1 - e * back, 1.0)
+    here, there = select(held, after.here, 1.0), select(held, after.there, 1.0)
+    remaining = 2 * rebound * (1 / here + back / there) / select(held, 1 - e * back, 1.0)
     window = 4 * remaining / scene.p
     change = functools.reduce(jnp.maximum, [m.change_at_rest(*steepest) for m in scene.different_moments])
     dies = held & (change * window <= weaker / 2) & (window <= reach)
@@ -128,8 +126,8 @@ def _rests(
         for moments in scene.different_moments:
             top = Angle.of(jnp.minimum(highest, moments.saddle))
             dies = dies & ((moments.restoring(top) / moments.restoring_at_rest) ** 2 >= state.closeness)
-    rests = keep_flag(hit & (dies | (rebound == 0)), state.local)
+    rests = materialize_flag(hit & (dies | (rebound == 0)), state.local)
     slower = e if scene.far is None else jnp.sqrt(e * back)  # mean ratio of speeds from hop to hop
     more = logarithm(low / jnp.maximum(rebound, low)) / logarithm(jnp.clip(slower, 1e-3, 1 - 1e-9))
-    more = where(rests, jnp.ceil(more).astype(state.impacts.dtype), 0)
-    return rests, more, where(rests & (rebound > 0), remaining / scene.p, 0.0)
+    more = select(rests, jnp.ceil(more).astype(state.impacts.dtype), 0)
+    return rests, more, select(rests & (rebound > 0), remaining / scene.p, 0.0)

@@ -6,20 +6,16 @@ from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Inexact
 
+from jaxrock._core.types import Flag, Scalar
+from jaxrock.compiler.hints import select, stop_gradient
 from jaxrock.engines.state import State
 from jaxrock.engines.stepper import AbstractStepper
 from jaxrock.models.equation import Angle
 from jaxrock.motions.motion import is_of_several
 from jaxrock.motions.shaking import Shaking
-from jaxrock.numerics.choice import where
-from jaxrock.numerics.fixed import fixed
+from jaxrock.numerics.derivatives_of import with_derivatives_of
 from jaxrock.numerics.polynomial import Watch, first_event, longest, meet, step_length
-from jaxrock.transforms.differentiation import with_derivatives_of
-
-Scalar = Inexact[Array, ""]
-Flag = Bool[Array, ""]
 
 
 def wait(
@@ -31,19 +27,19 @@ def wait(
     length = longest_wait(stepper, shaking, room, order, tolerance)
     never = scene.outlook.is_over(state.piece)
     # The state at rest does not depend on the length of a step: the length has no derivative.
-    room, length = fixed((room, where(jnp.isfinite(length), length, 0.0)))
+    room, length = stop_gradient((room, select(jnp.isfinite(length), length, 0.0)))
     lasting = room > 0  # in a zero-length piece nothing happens
     zero = jnp.zeros_like(length)
     lifted, found = [], []
     # A constant ground is the same at any scale; powers of a long time would overflow.
-    for drive, level in scene.drives_of(shaking.rescaled(where(_changes(shaking), length, 0.0))):
-        held, high = fixed((drive, level))
+    for drive, level in scene.drives_of(shaking.rescaled(select(_changes(shaking), length, 0.0))):
+        held, high = stop_gradient((drive, level))
         slope = held[1] if len(held) > 1 else zero
         slack = 8 * eps * high
         touching = lasting & (jnp.abs(high - held[0]) <= slack)
         lifts = lasting & (high - held[0] < -slack) | (touching & (slope > 0))
         # A threshold that the drive touches at the start counts as passed only beyond rounding.
-        least = high + where(touching, 2 * slack, 0.0)
+        least = high + select(touching, 2 * slack, 0.0)
 
         def search(found, needed, inside, held=held, least=least):
             series = [inside(c) for c in held] + [zero] * (2 - len(held))
@@ -54,20 +50,20 @@ def wait(
         # The comparison is negated, so that NaN takes the branch too and ends in a status.
         reachable = lasting & ~lifts & ~never & (state.side == 0) & ~(sum(jnp.abs(c) for c in held) < high)
         x, met = branch(reachable, search, (jnp.ones_like(length), jnp.zeros_like(lifts)))
-        found.append((where(met, meet(x, drive, level), x), met, x))
+        found.append((select(met, meet(x, drive, level), x), met, x))
         lifted.append((lifts, touching))
     (x, met, at), (x2, met2, at2) = found
     second = met2 & (~met | (at2 < at))
     met, early = met | met2, jnp.minimum(at, at2) < 1
-    x = where(second, x2, where(met, x, jnp.minimum(at, at2)))
+    x = select(second, x2, select(met, x, jnp.minimum(at, at2)))
     full = (length >= room) & ~early
     piece, local, over = stepper.move_on(state, x * length * unit, full)
-    piece = where(full & ~over & (not stepper.history), scene.after_quiet(piece), piece)
+    piece = select(full & ~over & (not stepper.history), scene.after_quiet(piece), piece)
     waited = replace(state, piece=piece, local=local, done=over | (never & ~early))
-    waited = lift(waited, where(second, -1.0, 1.0), met, met, zero > 0)
+    waited = lift(waited, select(second, -1.0, 1.0), met, met, zero > 0)
     (first, touching), (other, touching2) = lifted
-    at_once = lift(state, where(first, 1.0, -1.0), first | other, where(first, touching, touching2), first | other)
-    after = jax.tree.map(lambda a, b: where(first | other, a, b), at_once, waited)
+    at_once = lift(state, select(first, 1.0, -1.0), first | other, select(first, touching, touching2), first | other)
+    after = jax.tree.map(lambda a, b: select(first | other, a, b), at_once, waited)
     return _moved_by_ties(stepper, state, shaking, ~lasting, after) if is_of_several(scene.motion) else after
 
 
@@ -85,9 +81,11 @@ def _moved_by_ties(stepper: AbstractStepper, state: State, shaking: Shaking, tie
     for side, moments, (drive, level) in zip((1, -1), scene.both_moments, scene.drives_of(shaking)):
         lifts = tied & (drive[0] > level * (1 + 8 * eps))
         acceleration = moments.acceleration(Angle.of(zero), zero, side * push, weight)
-        velocity = where(lifts, velocity + side * gone * acceleration, velocity)
+        velocity = select(lifts, velocity + side * gone * acceleration, velocity)
         eager = eager | lifts
-    return replace(after, velocity=where(eager, with_derivatives_of(fixed(after.velocity), velocity), after.velocity))
+    return replace(
+        after, velocity=select(eager, with_derivatives_of(stop_gradient(after.velocity), velocity), after.velocity)
+    )
 
 
 def longest_wait(stepper: AbstractStepper, shaking: Shaking, room: Scalar, order: int, tolerance: float) -> Scalar:
@@ -97,7 +95,7 @@ def longest_wait(stepper: AbstractStepper, shaking: Shaking, room: Scalar, order
     for terms, scale in parts:
         if terms is not None and len(terms) > order:  # else a polynomial: exact
             cap = jnp.minimum(room, longest(len(terms), room.dtype))
-            cap = where(_changes(shaking), cap, room)  # a constant needs no cap
+            cap = select(_changes(shaking), cap, room)  # a constant needs no cap
             length = jnp.minimum(length, step_length(terms, tolerance * scale, cap))
     return length
 
@@ -114,14 +112,14 @@ def lift(state: State, side: Scalar, lifts: Flag, continuous: Flag, at_once: Fla
     Where uplift is `at_once`, the derivatives of the initial state continue, with the sign of that side. A wait ends
     them.
     """
-    moving = where(at_once, side, 0.0)
-    opening, velocity = (with_derivatives_of(fixed(x), moving * x) for x in (state.opening, state.velocity))
+    moving = select(at_once, side, 0.0)
+    opening, velocity = (with_derivatives_of(stop_gradient(x), moving * x) for x in (state.opening, state.velocity))
     return replace(
         state,
         opening=opening,
         velocity=velocity,
-        side=where(lifts, side, state.side),
-        uplifting=where(lifts, continuous, state.uplifting),
-        beyond=where(lifts, False, state.beyond),
-        extremal=where(lifts, False, state.extremal),
+        side=select(lifts, side, state.side),
+        uplifting=select(lifts, continuous, state.uplifting),
+        beyond=select(lifts, False, state.beyond),
+        extremal=select(lifts, False, state.extremal),
     )

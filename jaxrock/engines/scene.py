@@ -8,21 +8,21 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Inexact, Int
 
-from jaxrock._checks import put_down
-from jaxrock._parameters import check_single, in_precision, is_ours
+from jaxrock._arguments.parameters import check_single, in_precision, is_ours
+from jaxrock._core.types import Scalar
 from jaxrock.blocks.asymmetric import AsymmetricBlock
 from jaxrock.blocks.restitution import Reset, on_sides
 from jaxrock.blocks.rigid import Block
-from jaxrock.engines.outlook import Outlook
+from jaxrock.compiler import checks
+from jaxrock.compiler.hints import select
+from jaxrock.engines.remaining_forcing import RemainingForcing
 from jaxrock.models.coefficients import Coefficients
 from jaxrock.models.equation import AbstractEquation, AbstractMoments
 from jaxrock.motions.joined_records import in_place as found_in_place, is_in_place
 from jaxrock.motions.motion import AbstractMotion, is_of_several
 from jaxrock.motions.shaking import Shaking, sum_of_series
-from jaxrock.numerics.choice import where
-from jaxrock.numerics.lookup import pick
+from jaxrock.numerics.lookup import take
 
-Scalar = Inexact[Array, ""]
 _MANY = 32  # number of pieces from which on the knot array may be padded beyond the motion's end
 _TOGETHER = 4  # pieces to step back in a sum of motions, whose knots may coincide
 
@@ -35,7 +35,7 @@ def peak_bound(motion: AbstractMotion) -> Scalar:
 def _moments(block: Block | AsymmetricBlock, model: AbstractEquation) -> tuple:
     """Return the moments of side 1, and of side 2 if it has its own; time is p t, or p1 t on both sides."""
     if is_ours(model):  # `responses.current_model` checks traced parameters beforehand: machine code holds no checks
-        with put_down():
+        with checks.collect():
             return _made(block, model)
     return _made(block, model)
 
@@ -55,7 +55,7 @@ def _least_threshold(moments: AbstractMoments, far: AbstractMoments | None) -> S
 def _endless(values: Inexact[Array, " pieces"], count: Int[Array, ""] | None) -> Inexact[Array, " knots"]:
     """Append infinity for the quiet after the last piece; pieces past `count` are infinite, too."""
     values = jnp.concatenate([values, jnp.full(1, jnp.inf, values.dtype)])
-    return values if count is None else where(jnp.arange(values.size) < count, values, jnp.inf)
+    return values if count is None else select(jnp.arange(values.size) < count, values, jnp.inf)
 
 
 def uplift_threshold(block: Block | AsymmetricBlock, model: AbstractEquation) -> Scalar:
@@ -90,7 +90,7 @@ class Scene(eqx.Module):
     scales: Inexact[Array, " knots"] | None  # None: every piece is a straight line
     count: Int[Array, ""] | None  # pieces before the end; zero-length pieces may follow. None: all
     following: Int[Array, " knots"] | None  # the first piece of positive length from each one on; None: the next one
-    outlook: Outlook
+    outlook: RemainingForcing
     falls_flat: bool = eqx.field(static=True)
     first: Int[Array, ""] | None = None  # first piece, where the array joins many motions; None: 0
     room: int | None = eqx.field(static=True, default=None)  # most pieces of one of these motions
@@ -140,7 +140,7 @@ class Scene(eqx.Module):
             scales=None if motion.scales is None else _endless(motion.scales, None if stretch else count),
             count=count,
             following=motion.following,
-            outlook=Outlook.of(envelope, _least_threshold(moments, far)),
+            outlook=RemainingForcing.of(envelope, _least_threshold(moments, far)),
             falls_flat=model.falls_flat,
             first=None if stretch is None else stretch.first,
             room=None if stretch is None else stretch.room,
@@ -162,7 +162,7 @@ class Scene(eqx.Module):
             return self
 
         def of(here, there):
-            return jax.tree.map(lambda a, b: where(side < 0, b, a), here, there)
+            return jax.tree.map(lambda a, b: select(side < 0, b, a), here, there)
 
         return replace(
             self,
@@ -216,17 +216,17 @@ class Scene(eqx.Module):
         """Return the length of a piece [s]; the quiet after the motion has no end."""
         if self.here is not None:
             return self.here.length
-        return where(piece < self.pieces, self.motion.length(jnp.minimum(piece, self.pieces - 1)), jnp.inf)
+        return select(piece < self.pieces, self.motion.length(jnp.minimum(piece, self.pieces - 1)), jnp.inf)
 
     def start(self, piece: Int[Array, ""]) -> Scalar:
         """Return the time at which a piece begins [s]."""
         if self.here is None:
-            return pick(self.knots, piece)
-        return self.here.start + where(piece > self.here.number, self.here.length, 0.0)
+            return take(self.knots, piece)
+        return self.here.start + select(piece > self.here.number, self.here.length, 0.0)
 
     def scale(self, piece: Int[Array, ""]) -> Scalar | float:
         """Return the time in which the acceleration of a piece changes [s]."""
-        return jnp.inf if self.scales is None else pick(self.scales, piece)
+        return jnp.inf if self.scales is None else take(self.scales, piece)
 
     def shaking(self, piece: Int[Array, ""], local: Scalar, order: int) -> tuple[Shaking, Scalar]:
         """Return Taylor coefficients of the ground acceleration [g] in time/unit, and the unit [s]."""
@@ -236,4 +236,4 @@ class Scene(eqx.Module):
         shaking = Shaking(
             self.motion.series(inner, local, unit, order), self.motion.vertical_series(inner, local, unit, order)
         )
-        return shaking.each(lambda terms: [where(during, u, 0.0) for u in terms]), unit
+        return shaking.each(lambda terms: [select(during, u, 0.0) for u in terms]), unit

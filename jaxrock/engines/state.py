@@ -7,17 +7,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Inexact, Int
 
+from jaxrock._core.types import Flag, Scalar
+from jaxrock.compiler import custom_tangent
+from jaxrock.compiler.hints import select, stop_gradient
 from jaxrock.engines.scene import Scene
-from jaxrock.engines.uncertainty import Spread
+from jaxrock.engines.uncertainty import StateCovariance
 from jaxrock.models.equation import Angle
-from jaxrock.numerics.choice import where
-from jaxrock.numerics.fixed import fixed
-from jaxrock.numerics.given import given, is_zero
+from jaxrock.numerics.derivatives_of import with_derivatives_of
 from jaxrock.status import Status
-from jaxrock.transforms.differentiation import with_derivatives_of
-
-Scalar = Inexact[Array, ""]
-Flag = Bool[Array, ""]
 
 
 class State(eqx.Module):
@@ -44,7 +41,7 @@ class State(eqx.Module):
     # ground, or depth that a slowed block would have reached below it
     peak_clearance: Scalar  # `clearance` up to the peak
     second: Scalar  # second highest peak
-    spread: Spread  # covariance of the errors of opening and velocity
+    spread: StateCovariance  # covariance of the errors of opening and velocity
     overturned: Flag
     done: Flag
     status: Status
@@ -100,11 +97,11 @@ def initial_state(scene: Scene, rotation: Scalar, velocity: Scalar) -> State:
     """Return the state at time 0 from rotation [rad] and angular velocity [rad/s]."""
     velocity = velocity / scene.p
     least = float(jnp.finfo(rotation.dtype).tiny) ** 0.5  # squares of smaller numbers underflow
-    rotation, velocity = (where(jnp.abs(x) < least, x - fixed(x), x) for x in (rotation, velocity))
-    side = where(rotation != 0, jnp.sign(rotation), jnp.sign(velocity))
+    rotation, velocity = (select(jnp.abs(x) < least, x - stop_gradient(x), x) for x in (rotation, velocity))
+    side = select(rotation != 0, jnp.sign(rotation), jnp.sign(velocity))
     # At rest, derivatives are those of side 1, until `rest.lift` knows the side to which the block uplifts.
-    opening = with_derivatives_of(jnp.abs(rotation), where(side < 0, -rotation, rotation))
-    outward = with_derivatives_of(side * velocity, where(side < 0, -velocity, velocity))
+    opening = with_derivatives_of(jnp.abs(rotation), select(side < 0, -rotation, rotation))
+    outward = with_derivatives_of(side * velocity, select(side < 0, -velocity, velocity))
     zero, no = jnp.zeros_like(opening), jnp.zeros_like(opening, bool)
     count = jnp.zeros_like(opening, jnp.int32)
     moments = scene.on(side).moments
@@ -123,9 +120,9 @@ def initial_state(scene: Scene, rotation: Scalar, velocity: Scalar) -> State:
     forward = scene.motion.lasting.forward if scene.first is None else scene.motion.length(scene.first) >= 0
     forward = forward & (scene.knots[0] >= 0) & (scene.knots[-1] >= 0)
     finite = finite & (scene.threshold > 0) & (scene.p > 0) & forward
-    spread = Spread.none(opening).plus(eps * opening, eps * outward)
-    if scene.motion.lateness is not None:  # a push that comes too late: at first the velocity lacks its impulse
-        spread = spread.plus(0.0, scene.outlook.strongest_drive * scene.p * scene.motion.lateness)
+    spread = StateCovariance.none(opening).plus(eps * opening, eps * outward)
+    if scene.motion.time_rounding is not None:  # a push that comes too late: at first the velocity lacks its impulse
+        spread = spread.plus(0.0, scene.outlook.strongest_drive * scene.p * scene.motion.time_rounding)
     return State(
         piece=count if scene.first is None else scene.first,
         local=zero,
@@ -135,15 +132,15 @@ def initial_state(scene: Scene, rotation: Scalar, velocity: Scalar) -> State:
         uplifting=no,
         beyond=beyond,
         extremal=no,
-        peak=where(side == 0, zero, opening),
+        peak=select(side == 0, zero, opening),
         peak_time=zero,
         error=zero,
-        fastest=where(side == 0, zero, jnp.abs(outward)),
+        fastest=select(side == 0, zero, jnp.abs(outward)),
         impacts=count,
         impact_time=zero,
         impact_velocity=zero,
-        closeness=where(side == 0, unlifted, where(outward == 0, jnp.minimum(stillness, 1.0), 1.0)),
-        closeness_beyond=where(beyond, stillness, jnp.inf),
+        closeness=select(side == 0, unlifted, select(outward == 0, jnp.minimum(stillness, 1.0), 1.0)),
+        closeness_beyond=select(beyond, stillness, jnp.inf),
         clearance=jnp.full_like(opening, jnp.inf),
         peak_clearance=jnp.full_like(opening, jnp.inf),
         second=zero,
@@ -163,17 +160,17 @@ def all_moving(state: State, scene: Scene) -> State:
     """
     path = [getattr(state, name) for name in _MOVES]
     numbers = [x for x in jax.tree.leaves(scene) if not jnp.shape(x)]
-    return replace(state, **dict(zip(_MOVES, given(_all_move, path, (path, numbers)))))
+    return replace(state, **dict(zip(_MOVES, custom_tangent(_all_move, path, (path, numbers)))))
 
 
 def _all_move(values: list, _, changes: tuple) -> list:
     own, numbers = changes
-    moving = [d for d in (*own, *numbers) if not is_zero(d) and jnp.issubdtype(d.dtype, jnp.inexact)]
+    moving = [d for d in (*own, *numbers) if d is not None and jnp.issubdtype(d.dtype, jnp.inexact)]
     if not moving:
         return own
     # `where` makes zeros that vary between lanes under `jax.vmap` over directions, if the tangents do.
-    none = where(jnp.zeros((), bool), moving[0], 0.0).astype(values[0].dtype)
-    return [none if is_zero(d) else d for d in own]
+    none = select(jnp.zeros((), bool), moving[0], 0.0).astype(values[0].dtype)
+    return [none if d is None else d for d in own]
 
 
 def surpasses(value: Scalar, best: Scalar) -> Flag:

@@ -12,14 +12,13 @@ from typing import TYPE_CHECKING, TypeVar
 import equinox as eqx
 import jax.numpy as jnp
 from equinox import AbstractVar
-from jaxtyping import Array, Bool, Inexact, Int, PyTree
+from jaxtyping import Array, Int, PyTree
 
+from jaxrock._core.types import Flag, Scalar
+from jaxrock.compiler.hints import select
 from jaxrock.engines.scene import Scene
 from jaxrock.engines.state import Node, State
-from jaxrock.numerics.choice import where
 
-Scalar = Inexact[Array, ""]
-Flag = Bool[Array, ""]
 Stepper = TypeVar("Stepper", bound="AbstractStepper")
 
 
@@ -109,15 +108,15 @@ class AbstractStepper(eqx.Module):
         room = self._to_knot(state)
         if self.stop is not None:
             left = self.stop - self.time(state)
-            room = where(room <= left, room, left)
-        return where(room < 0, 0.0, room)
+            room = select(room <= left, room, left)
+        return select(room < 0, 0.0, room)
 
     def _to_knot(self, state: State) -> Scalar:
         return self.scene.length(state.piece) - state.local
 
     def _is_over_by(self, stop: Scalar, piece: Int[Array, ""]) -> Flag:
         """Return whether a piece ends before the stop or with it: a computed duration may round to either side."""
-        following = where(piece < self.scene.pieces, self.scene.start(piece + 1), jnp.inf)
+        following = select(piece < self.scene.pieces, self.scene.start(piece + 1), jnp.inf)
         return following <= stop * (1 + 8 * float(jnp.finfo(following.dtype).eps))
 
     def move_on(self, state: State, elapsed: Scalar, full: Flag) -> tuple[Int[Array, ""], Scalar, Flag]:
@@ -128,6 +127,6 @@ class AbstractStepper(eqx.Module):
         if (
             self.scene.following is not None and not self.history
         ):  # a history takes as many steps with derivatives as without
-            piece = where(ends, self.scene.from_here(piece), piece)
+            piece = select(ends, self.scene.from_here(piece), piece)
         over = piece >= self.scene.pieces if self.stop is None else full & ~ends
-        return piece, where(ends, 0.0, state.local + elapsed), over
+        return piece, select(ends, 0.0, state.local + elapsed), over

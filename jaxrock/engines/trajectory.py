@@ -11,10 +11,11 @@ import numpy as np
 from equinox.internal import unvmap_any
 from jaxtyping import Array, Bool, Inexact, Int, PyTree, UInt
 
-from jaxrock._checks import Values, checked, if_traced, is_at_hand, is_traced, placed
-from jaxrock.numerics.choice import where
+from jaxrock._arguments.ranges import checked
+from jaxrock._core.arrays import Values, if_traced, is_concrete, is_traced, to_device
+from jaxrock.compiler import lane_function
+from jaxrock.compiler.hints import select
 from jaxrock.status import still_where
-from jaxrock.transforms.differentiation import differentiable
 
 
 class Trajectory(eqx.Module):
@@ -50,7 +51,7 @@ class Trajectory(eqx.Module):
     def equally_spaced(self, samples: int) -> Inexact[Array, " samples"]:
         """Return `samples` times from 0 to the duration, bitwise equal within `jax.jit` and outside."""
         shares = np.linspace(0, 1, samples).astype(self.duration.dtype)
-        return placed(np.asarray(self.duration) * shares) if is_at_hand(self.duration) else self.duration * shares
+        return to_device(np.asarray(self.duration) * shares) if is_concrete(self.duration) else self.duration * shares
 
     def before(
         self, time: Inexact[Array | np.ndarray, "..."], nodes: PyTree
@@ -61,7 +62,7 @@ class Trajectory(eqx.Module):
         XLA would compile a program, which takes much longer than the lookup.
         """
         given = nodes, self.nodes.done, self.times, self.duration, time
-        return _before(np, *jax.tree.map(np.asarray, given)) if is_at_hand(given) else _before(jnp, *given)
+        return _before(np, *jax.tree.map(np.asarray, given)) if is_concrete(given) else _before(jnp, *given)
 
     def events(self, told: Callable) -> tuple:
         """Return values at the nodes where an event happened, in order. Under jit they are padded: infinite times,
@@ -71,10 +72,10 @@ class Trajectory(eqx.Module):
         that orders the events, and pairs of a value and its padding.
         """
         self.check_single()
-        if is_at_hand(self):  # XLA would compile a program, which takes much longer than the lookup
+        if is_concrete(self):  # XLA would compile a program, which takes much longer than the lookup
             happened, order, *values = told(np, jax.tree.map(np.asarray, self))
             order = np.flatnonzero(happened)[np.argsort(order[happened], stable=True)]
-            return tuple(placed(np.asarray(value)[order]) for value, _ in values)
+            return tuple(to_device(np.asarray(value)[order]) for value, _ in values)
         found, count = _in_order(self, told)
         if is_traced(count):
             return found
@@ -112,11 +113,11 @@ def at_times(
 @functools.partial(jax.jit, static_argnames="told")
 def _in_order(path: Trajectory, told: Callable) -> tuple[tuple, Int[Array, ""]]:
     happened, order, *values = told(jnp, path)
-    order = jnp.argsort(where(happened, order, jnp.inf), stable=True)
+    order = jnp.argsort(select(happened, order, jnp.inf), stable=True)
     found = []
     for value, filling in values:
         here = happened.reshape(happened.shape + (1,) * (value.ndim - 1))
-        found.append(where(here, value, filling)[order])
+        found.append(select(here, value, filling)[order])
     return tuple(found), happened.sum()
 
 
@@ -154,7 +155,7 @@ def states_of(
         return state, jax.tree.map(lambda x: jax.ShapeDtypeStruct((_STRIDE, *x.shape), x.dtype), kept)
 
     name = f"stride, {keep.__qualname__}"
-    many = differentiable(stride, name=name, results=rows, in_lanes=True, derivatives="in a direction")
+    many = lane_function(stride, key=name, results=rows, in_lanes=True, mode="jvp")
     return _in_strides(lambda s: many((stepper, s, jnp.int32(limit))), state, limit, engine.loop, room, keep, _STRIDE)
 
 
@@ -218,7 +219,7 @@ def _stride(
 
     def step(state):
         going, after = _unfinished(state, limit), advance(state)
-        return jax.tree.map(lambda new, old: where(going, new, old), after, state)
+        return jax.tree.map(lambda new, old: select(going, new, old), after, state)
 
     def one_more(carry):
         left, state, kept = carry
@@ -235,4 +236,4 @@ def _stride(
 
 def times_of(time: Callable, nodes: PyTree, steps: Int[Array, ""]) -> Inexact[Array, " nodes"]:
     """Return the times of the nodes up to the last state, after `steps` steps; infinite past it."""
-    return where(jnp.arange(nodes.done.size) <= steps, jax.vmap(time)(nodes), jnp.inf)
+    return select(jnp.arange(nodes.done.size) <= steps, jax.vmap(time)(nodes), jnp.inf)

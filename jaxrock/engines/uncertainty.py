@@ -12,12 +12,11 @@ import math
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Inexact
+from jaxtyping import Array, Bool
 
-from jaxrock.numerics.choice import where
+from jaxrock._core.types import Scalar
+from jaxrock.compiler.hints import select
 from jaxrock.numerics.polynomial import horner
-
-Scalar = Inexact[Array, ""]
 
 # Series of cosh(x) and sinh(x)/x in x^2, without divisions; up to here accurate to 2e-7, enough for an error estimate.
 _NEAR = 4.0
@@ -28,7 +27,7 @@ _SINH_RATIO = tuple(1 / math.factorial(2 * k + 1) for k in range(7))
 GRAZING = 32.0
 
 
-class Spread(eqx.Module):
+class StateCovariance(eqx.Module):
     """Variances and covariance of the errors of opening angle and velocity (per p t) [rad^2]."""
 
     xx: Scalar
@@ -36,15 +35,15 @@ class Spread(eqx.Module):
     vv: Scalar
 
     @classmethod
-    def none(cls, like: Scalar) -> "Spread":
+    def none(cls, like: Scalar) -> "StateCovariance":
         """Return zero errors."""
         zero = jnp.zeros_like(like)
         return cls(zero, zero, zero)
 
     @classmethod
-    def where(cls, condition: Bool[Array, ""], one: "Spread", other: "Spread") -> "Spread":
+    def where(cls, condition: Bool[Array, ""], one: "StateCovariance", other: "StateCovariance") -> "StateCovariance":
         """Select `one` where the condition holds, else `other`."""
-        return cls(*(where(condition, a, b) for a, b in zip(one._parts, other._parts)))
+        return cls(*(select(condition, a, b) for a, b in zip(one._parts, other._parts)))
 
     @property
     def _parts(self) -> tuple[Scalar, Scalar, Scalar]:
@@ -69,23 +68,23 @@ class Spread(eqx.Module):
         variance = of_angle**2 * self.xx + 2 * of_angle * of_velocity * self.xv + of_velocity**2 * self.vv
         return jnp.maximum(variance, 0.0)
 
-    def plus(self, angle: Scalar | float, velocity: Scalar | float) -> "Spread":
+    def plus(self, angle: Scalar | float, velocity: Scalar | float) -> "StateCovariance":
         """Add independent errors."""
         return self.plus_variance(angle**2, velocity**2)
 
-    def plus_variance(self, angle: Scalar | float, velocity: Scalar | float) -> "Spread":
+    def plus_variance(self, angle: Scalar | float, velocity: Scalar | float) -> "StateCovariance":
         """Add the squares of independent errors."""
-        return Spread(self.xx + angle, self.xv, self.vv + velocity)
+        return StateCovariance(self.xx + angle, self.xv, self.vv + velocity)
 
-    def _through(self, a: Scalar, b: Scalar | float, c: Scalar, d: Scalar) -> "Spread":
+    def _through(self, a: Scalar, b: Scalar | float, c: Scalar, d: Scalar) -> "StateCovariance":
         """Return M S M' with M = [[a, b], [c, d]]."""
-        return Spread(
+        return StateCovariance(
             a * a * self.xx + 2 * a * b * self.xv + b * b * self.vv,
             a * c * self.xx + (a * d + b * c) * self.xv + b * d * self.vv,
             c * c * self.xx + 2 * c * d * self.xv + d * d * self.vv,
         )
 
-    def after_flow(self, repulsion: Scalar, time: Scalar) -> "Spread":
+    def after_flow(self, repulsion: Scalar, time: Scalar) -> "StateCovariance":
         """Return the errors after a time (p t) under x'' = repulsion x; an attraction counts as zero."""
         pull = jnp.maximum(repulsion, 1e-12)  # positive for arcs of infinite length, too
         square = pull * time**2
@@ -100,7 +99,9 @@ class Spread(eqx.Module):
         odd = ratio * time
         return self._through(even, odd, pull * odd, even)
 
-    def after_impact(self, speed: Scalar, before: Scalar, after: Scalar, ratio: Scalar, slope: Scalar) -> "Spread":
+    def after_impact(
+        self, speed: Scalar, before: Scalar, after: Scalar, ratio: Scalar, slope: Scalar
+    ) -> "StateCovariance":
         """Return the errors after an impact at `speed` < 0, with the opening's accelerations before and after it.
 
         `ratio`: e, the speed after the impact over the speed before; `slope`: e', the derivative of the one by the
@@ -116,4 +117,4 @@ class Spread(eqx.Module):
         bounded = jnp.minimum(jnp.minimum(speed, -fallen), -1e-18)
         missed = (before > 0) & ~(speed**4 > (2 * GRAZING * before) ** 2 * self.xx)
         spread = self._through(ratio, 0.0, kick / bounded, slope)
-        return spread.plus(0.0, where(missed, (1 + ratio) * jnp.abs(speed), 0.0))
+        return spread.plus(0.0, select(missed, (1 + ratio) * jnp.abs(speed), 0.0))

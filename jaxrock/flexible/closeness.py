@@ -13,10 +13,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Inexact, Int
 
+from jaxrock._core.types import Scalar
 from jaxrock.flexible.phases import Arc, Phase
 from jaxrock.numerics.roots import implicit
 
-Scalar = Inexact[Array, ""]
 _HALVINGS = 40  # bisections of a step for its least distance
 
 

@@ -15,16 +15,16 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Inexact
 
+from jaxrock._core.types import Scalar
 from jaxrock.blocks.cantilever import unit_column
 from jaxrock.blocks.flexible import FlexibleBlock
 from jaxrock.flexible.phases import Numbers
 from jaxrock.numerics.roots import implicit
 
-Scalar = Inexact[Array, ""]
 Modal = Inexact[Array, " modes"]
 
 
-class Column(eqx.Module):
+class ColumnConstants(eqx.Module):
     """The constants of a block in the equations, beside its `Numbers`."""
 
     numbers: Numbers
@@ -34,7 +34,7 @@ class Column(eqx.Module):
     p_delta: bool = eqx.field(static=True)
 
     @classmethod
-    def of(cls, block: FlexibleBlock) -> "Column":
+    def of(cls, block: FlexibleBlock) -> "ColumnConstants":
         """Collect the constants of a block of scalars."""
         weight = block.gravity / block.length
         return cls(Numbers.of(block), weight, block.base, block.rotations == "finite", block.p_delta)
@@ -134,6 +134,6 @@ class Column(eqx.Module):
         return jnp.append(weighed, moment / numbers.spring_rate)
 
 
-def _to_saddle(column: Column, x: Inexact[Array, " unknowns"]) -> Inexact[Array, " unknowns"]:
+def _to_saddle(column: ColumnConstants, x: Inexact[Array, " unknowns"]) -> Inexact[Array, " unknowns"]:
     lack, slopes = jax.vmap(lambda d: jax.jvp(column.lack, (x,), (d,)), out_axes=(None, 1))(jnp.eye(x.size))
     return jnp.linalg.solve(slopes, lack)

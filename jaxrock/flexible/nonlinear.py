@@ -7,15 +7,15 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Inexact
 
+from jaxrock._core.types import Scalar
 from jaxrock.blocks.flexible import FlexibleBlock
-from jaxrock.flexible.column import Column
+from jaxrock.flexible.column import ColumnConstants
 from jaxrock.flexible.phases import Phase, arc, locked_phase, rocking_phase
 from jaxrock.flexible.remainder import NonlinearArc, Tangents, nonlinear_arc
 from jaxrock.flexible.stepper import FlexibleScene, FlexibleState, resets_of
 from jaxrock.motions.motion import AbstractMotion
 from jaxrock.status import Status
 
-Scalar = Inexact[Array, ""]
 _PRECISION = 10_000  # tolerance of a step, in units of rounding
 _SHORTEST = 1e-12  # shortest step over duration
 
@@ -28,7 +28,7 @@ class NonlinearScene(FlexibleScene):
     @classmethod
     def of(cls, block: FlexibleBlock, ground: AbstractMotion, stop: Scalar) -> "NonlinearScene":
         """Build the scene from scalars."""
-        tangents = Tangents.of(Column.of(block))
+        tangents = Tangents.of(ColumnConstants.of(block))
         numbers = tangents.numbers
         rocking, whole = rocking_phase(numbers)
         # Reject a column that leans too far before it balances.

@@ -19,13 +19,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Inexact
 
+from jaxrock._core.types import Scalar
 from jaxrock.blocks.cantilever import unit_column
 from jaxrock.blocks.flexible import FlexibleBlock
+from jaxrock.numerics.derivatives_of import with_derivatives_of
 from jaxrock.numerics.exponential_sums import Curve, powers
 from jaxrock.numerics.roots import implicit
-from jaxrock.transforms.differentiation import with_derivatives_of
-
-Scalar = Inexact[Array, ""]
 
 
 class _Damping(NamedTuple):

@@ -15,11 +15,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Inexact
 
-from jaxrock.flexible.column import Column
+from jaxrock._core.types import Scalar
+from jaxrock.flexible.column import ColumnConstants
 from jaxrock.flexible.phases import Arc, Numbers, answers, rising_terms
 from jaxrock.numerics.exponential_sums import Curve, powers
 
-Scalar = Inexact[Array, ""]
 States = Inexact[Array, "points states"]
 
 POINTS = 11
@@ -48,7 +48,7 @@ _SLOPE = np.diag(np.arange(1.0, POINTS), 1)  # maps coefficients to those of the
 class Tangents(eqx.Module):
     """The linear column about its unstable equilibrium, in modes that its weight does not couple."""
 
-    column: Column
+    column: ColumnConstants
     numbers: Numbers
     turn: Inexact[Array, "modes modes"]  # columns: these modes in terms of the clamped modes
     pull: Inexact[Array, "modes modes"]  # stiffness of the weight in these modes
@@ -57,7 +57,7 @@ class Tangents(eqx.Module):
     slope: Scalar  # slope of that moment, in balance
 
     @classmethod
-    def of(cls, column: Column) -> "Tangents":
+    def of(cls, column: ColumnConstants) -> "Tangents":
         """Linearise a column."""
         numbers, n = column.numbers, column.numbers.rotation.size
         one, none = jnp.ones(()), jnp.zeros(n)

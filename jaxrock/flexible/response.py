@@ -8,23 +8,25 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Inexact, Int
 
-from jaxrock._arguments import arguments, at_least
-from jaxrock._checks import Values, by_numpy_or_one_program, scalar, span, throwing
-from jaxrock._parameters import check_single
-from jaxrock._precision import say_if_single
-from jaxrock._quickly import quickly
-from jaxrock._settings import called_by_users
-from jaxrock._tables import AbstractTable, over_time
+from jaxrock._arguments.annotations import arguments, at_least
+from jaxrock._arguments.parameters import check_single
+from jaxrock._arguments.ranges import scalar, span
+from jaxrock._arguments.tables import AbstractTable, over_time
+from jaxrock._core.arrays import Values
+from jaxrock._core.one_program import by_numpy_or_one_program
+from jaxrock._core.precision import say_if_single
+from jaxrock._core.settings import called_by_users
+from jaxrock._core.throwing import throwing
+from jaxrock._core.types import Real
 from jaxrock.blocks.flexible import FlexibleBlock
+from jaxrock.compiler import checks, lane_function
+from jaxrock.compiler.hints import jit_low_effort
 from jaxrock.engines.trajectory import Trajectory, at_times, followed, times_of
 from jaxrock.flexible.nonlinear import scene_of
 from jaxrock.flexible.stepper import FlexibleOutcome, FlexibleScene
+from jaxrock.motions.mirrored import has_vertical
 from jaxrock.motions.motion import AbstractMotion
-from jaxrock.motions.turned import has_vertical
-from jaxrock.status import Status, marked_result, still_if_none
-from jaxrock.transforms.differentiation import differentiable
-
-Scalar = Inexact[Array, "..."]
+from jaxrock.status import Status, still_if_none
 
 
 class FlexibleResponse(AbstractTable):
@@ -100,7 +102,7 @@ class FlexibleResponse(AbstractTable):
         return self.outcome.status
 
     @property
-    def max_rotation(self) -> Scalar:
+    def max_rotation(self) -> Real:
         """Largest |rotation| of the base [rad]; infinite if the block overturned."""
         return self.outcome.max_rotation
 
@@ -137,7 +139,7 @@ def _modes_of(_, path: Trajectory) -> tuple:
 
 
 @jax.jit
-def _shares(motion: Scalar, squares: Scalar) -> Scalar:
+def _shares(motion: Real, squares: Real) -> Real:
     """Return the share of each mode in the energy at each step."""
     q, v = jnp.split(motion[:, :-1], 2, axis=1)
     energies = v**2 + squares * q**2
@@ -174,7 +176,7 @@ def outcome_flexible(
     say_if_single()
     given = _given(block, motion, duration, throw)
     result = _outcome(*given, _budget(block, motion, max_steps))
-    return result if throw else marked_result(result, given)
+    return result if throw else checks.nan_where_inputs_are(result, given)
 
 
 @arguments
@@ -205,12 +207,12 @@ def simulate_flexible(
     time = path.equally_spaced(samples)
     rotation, displacement, bending = _at_times(path, time, "outputs")[:3]
     response = FlexibleResponse(time, rotation, displacement, bending, result, path)
-    return response if throw else marked_result(response, given)
+    return response if throw else checks.nan_where_inputs_are(response, given)
 
 
 def _given(
     block: FlexibleBlock, motion: AbstractMotion, duration: ArrayLike | None, throw: bool
-) -> tuple[FlexibleBlock, AbstractMotion, Scalar]:
+) -> tuple[FlexibleBlock, AbstractMotion, Real]:
     """Check the arguments, and return block, motion and duration."""
     if throw:
         return block, motion, _duration(block, motion, duration, throw)
@@ -218,7 +220,7 @@ def _given(
     return still_if_none((block, motion, _duration(block, motion, duration, throw)))
 
 
-def _duration(block: FlexibleBlock, motion: AbstractMotion, duration: ArrayLike | None, throw: bool) -> Scalar:
+def _duration(block: FlexibleBlock, motion: AbstractMotion, duration: ArrayLike | None, throw: bool) -> Real:
     check_single(block=block, motion=motion)
     if has_vertical(motion):
         raise ValueError(
@@ -235,17 +237,17 @@ def _budget(block: FlexibleBlock, motion: AbstractMotion, max_steps: int | None)
     return (max_steps or usual) + 4 * motion.knots.size
 
 
-@quickly(static_argnames="budget")
+@jit_low_effort(static_argnames="budget")
 def _outcome(block, motion, stop, budget: int) -> FlexibleOutcome:
     def run(given):
         scene = scene_of(*given)
         state = jax.lax.while_loop(lambda s: ~s.done & (s.steps < budget), lambda s: scene.advance(s), scene.start())
         return scene.conclude(state)
 
-    return differentiable(run)((block, motion, stop))
+    return lane_function(run)((block, motion, stop))
 
 
-@quickly(static_argnames="budget")
+@jit_low_effort(static_argnames="budget")
 def _simulate(block, motion, stop, budget: int) -> tuple[FlexibleOutcome, Trajectory]:
     def loop(unfinished, step, carry, budget):
         return jax.lax.while_loop(unfinished, step, carry)
@@ -258,7 +260,7 @@ def _simulate(block, motion, stop, budget: int) -> tuple[FlexibleOutcome, Trajec
         return scene.conclude(state), Trajectory(scene, nodes, times, impacted, given[-1])
 
     # A full Jacobian of all steps by every sample of a record would be too large.
-    return differentiable(run, derivatives="a few at once")((block, motion, stop))
+    return lane_function(run, mode="jacobian or jvp")((block, motion, stop))
 
 
 @by_numpy_or_one_program(static_argnums=2)
@@ -267,7 +269,7 @@ def _at_times(path: Trajectory, time, what: str):
     return _after_nodes(path.stepper, *path.before(time, path.nodes), path.duration, time.shape, what)
 
 
-@quickly(static_argnames=("shape", "what"))
+@jit_low_effort(static_argnames=("shape", "what"))
 def _after_nodes(scene, node, elapsed, duration, shape, what: str):
     reach = jnp.cos(scene.numbers.alpha) * scene.block.length
     scales = jnp.array([1.0, 0, 0, 1.0]) + jnp.array([0.0, 1, 1, 0]) * reach

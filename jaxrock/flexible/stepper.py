@@ -11,20 +11,20 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Complex, Inexact, Int
 
-from jaxrock._tables import AbstractTable, Column, scenes
+from jaxrock._arguments.tables import AbstractTable, Column, scenes
+from jaxrock._core.types import Real
 from jaxrock.blocks.cantilever import unit_column
 from jaxrock.blocks.flexible import FlexibleBlock, is_possible
 from jaxrock.blocks.restitution import Reset, on_sides
 from jaxrock.flexible.closeness import approached, mirrored, still_to_come
 from jaxrock.flexible.phases import Arc, Numbers, Phase, arc, locked_phase, rocking_phase
 from jaxrock.motions.motion import AbstractMotion
+from jaxrock.numerics.derivatives_of import with_derivatives_of
 from jaxrock.numerics.exponential_sums import Curve, first_exit, highest, powers
 from jaxrock.numerics.polynomial import step_length
 from jaxrock.numerics.roots import implicit
 from jaxrock.status import Status
-from jaxrock.transforms.differentiation import with_derivatives_of
 
-Scalar = Inexact[Array, "..."]
 _ORDER = 16  # order of the motion's Taylor series
 
 
@@ -32,19 +32,19 @@ class FlexibleState(eqx.Module):
     """State of a flexible block, and extremes so far."""
 
     piece: Int[Array, ""]
-    local: Scalar  # time since the start of the piece [s]
+    local: Real  # time since the start of the piece [s]
     motion: Inexact[Array, " states"]  # (q, q', theta)
-    side: Scalar  # 0: the base is locked
-    last_side: Scalar  # side from which the base returned last
-    stay: Scalar  # time for which the base has rocked on this side [s]
-    braked_stay: Scalar  # the stay that the last impact ended [s]
+    side: Real  # 0: the base is locked
+    last_side: Real  # side from which the base returned last
+    stay: Real  # time for which the base has rocked on this side [s]
+    braked_stay: Real  # the stay that the last impact ended [s]
     maxima: Inexact[Array, " six"]  # of rotation, top displacement over L, its bending part; of their negatives
-    closeness: Scalar  # smallest squared distance from standing still in balance (`margin`)
-    closeness_beyond: Scalar  # `closeness` since the last outward crossing of the balance
+    closeness: Real  # smallest squared distance from standing still in balance (`margin`)
+    closeness_beyond: Real  # `closeness` since the last outward crossing of the balance
     impacts: Int[Array, ""]
     impacted: Bool[Array, ""]  # an impact made this state
     fallen: Bool[Array, ""]
-    stride: Scalar  # longest step that the remainder allows [s]
+    stride: Real  # longest step that the remainder allows [s]
     done: Bool[Array, ""]
     status: Status
     steps: Int[Array, ""]
@@ -67,13 +67,13 @@ class FlexibleOutcome(AbstractTable):
       but is not lost. While the ground shakes, a loss is not known.
     """
 
-    max_rotation: Scalar
-    max_displacement: Scalar
-    max_bending: Scalar
+    max_rotation: Real
+    max_displacement: Real
+    max_bending: Real
     impact_count: Int[Array, "..."]
     overturned: Bool[Array, "..."]
-    margin: Scalar
-    energy: Scalar
+    margin: Real
+    energy: Real
     status: Status
 
     @property
@@ -98,7 +98,7 @@ def _may_be(block: FlexibleBlock, ground: AbstractMotion) -> Bool[Array, ""]:
     return is_possible(block) & forward
 
 
-def _ratio(resets: tuple[Reset, ...], side: Scalar, speed: Scalar) -> Scalar:
+def _ratio(resets: tuple[Reset, ...], side: Real, speed: Real) -> Real:
     ratios = [reset.ratio(speed) for reset in resets]
     return ratios[0] if len(ratios) == 1 else jnp.where(side < 0, ratios[1], ratios[0])
 
@@ -108,7 +108,7 @@ class FlexibleScene(eqx.Module):
 
     block: FlexibleBlock
     ground: AbstractMotion
-    stop: Scalar
+    stop: Real
     numbers: Numbers
     locked: Phase
     rocking: Phase
@@ -117,7 +117,7 @@ class FlexibleScene(eqx.Module):
     knots: Inexact[Array, " knots"]
 
     @classmethod
-    def of(cls, block: FlexibleBlock, ground: AbstractMotion, stop: Scalar) -> "FlexibleScene":
+    def of(cls, block: FlexibleBlock, ground: AbstractMotion, stop: Real) -> "FlexibleScene":
         """Build the scene from scalars."""
         numbers = Numbers.of(block)
         rocking, whole = rocking_phase(numbers)
@@ -150,15 +150,15 @@ class FlexibleScene(eqx.Module):
             steps=count,
         )
 
-    def time(self, state: FlexibleState) -> Scalar:
+    def time(self, state: FlexibleState) -> Real:
         """Return the time of a state [s]."""
         return self.knots[state.piece] + state.local
 
-    def longest(self, state: FlexibleState) -> Scalar:
+    def longest(self, state: FlexibleState) -> Real:
         """Return the longest step [s]: after a growth of more than e^10, the unstable mode would hide the others."""
         return 10 / jax.lax.stop_gradient(jnp.max(self.rocking.rates.real))
 
-    def arc(self, state: FlexibleState) -> tuple[Arc, Scalar, Scalar, Bool[Array, ""]]:
+    def arc(self, state: FlexibleState) -> tuple[Arc, Real, Real, Bool[Array, ""]]:
         """Return the arc from this state, its length [s], the share of it within this piece, and whether it ends with
         the piece.
 
@@ -168,7 +168,7 @@ class FlexibleScene(eqx.Module):
         phase = Phase.where(state.side == 0, self.locked, self.rocking)
         return arc(self.numbers, phase, state.side, state.motion, load, length), length, share, whole
 
-    def load(self, state: FlexibleState) -> tuple[Inexact[Array, " order"], Scalar, Scalar, Bool[Array, ""]]:
+    def load(self, state: FlexibleState) -> tuple[Inexact[Array, " order"], Real, Real, Bool[Array, ""]]:
         """Return the ground acceleration [g] along the arc from here, and the rest that `arc` returns."""
         quiet, inner = state.piece >= self.knots.size - 1, jnp.minimum(state.piece, self.knots.size - 2)
         lasts = jnp.where(quiet, jnp.inf, self.ground.lengths[inner])
@@ -193,7 +193,7 @@ class FlexibleScene(eqx.Module):
         return self.step_on(state, *self.arc(state))
 
     def step_on(
-        self, state: FlexibleState, path: Arc, length: Scalar, share: Scalar, whole: Bool[Array, ""]
+        self, state: FlexibleState, path: Arc, length: Real, share: Real, whole: Bool[Array, ""]
     ) -> FlexibleState:
         """Advance along an arc."""
         rows = path.curves()
@@ -270,11 +270,11 @@ class FlexibleScene(eqx.Module):
         return jnp.concatenate([jnp.zeros(1), column.shapes @ motion[: self.block.masses - 1]])
 
     @property
-    def summit(self) -> Scalar:
+    def summit(self) -> Real:
         """Return the energy of the unstable equilibrium, over m L^2 [1/s^2]."""
         return self.numbers.strength * self.numbers.balance / 2
 
-    def energy(self, motion: Inexact[Array, " states"]) -> tuple[Scalar, Scalar, Scalar]:
+    def energy(self, motion: Inexact[Array, " states"]) -> tuple[Real, Real, Real]:
         """Return kinetic energy, strain energy of the column, potential energy of the base, over m L^2 [1/s^2]."""
         numbers = self.numbers
         q, v = jnp.split(motion[:-1], 2)
@@ -313,7 +313,7 @@ class FlexibleScene(eqx.Module):
         others = jnp.sum(jnp.where(growing, 0.0, jnp.abs(amplitudes)))
         return (side != 0) & (outward > 0) & (self.numbers.balance + outward > others)
 
-    def _margin(self, state: FlexibleState, gone: Bool[Array, ""]) -> Scalar:
+    def _margin(self, state: FlexibleState, gone: Bool[Array, ""]) -> Real:
         """Return the margin: the closeness so far, and that of the present swing if the ground rests from now on."""
         grows, decays = mirrored(self.rocking)
         outward, inward = (state.side * self._amplitudes(state).real[k] for k in (grows, decays))
@@ -325,7 +325,7 @@ class FlexibleScene(eqx.Module):
         return jnp.where(gone, -fallen, jnp.minimum(state.closeness, ahead))
 
 
-def _to_level(told: tuple[Curve, Scalar], x: Scalar) -> Scalar:
+def _to_level(told: tuple[Curve, Real], x: Real) -> Real:
     """Return the Newton step to where a curve crosses a level."""
     curve, level = told
     value, slope, _ = curve.jet(x)

@@ -3,7 +3,7 @@
 The package imports `studies`, `responses` and `sweeps`. Start reading with `fragility`, then `curves` and `survival`.
 """
 
-from jaxrock._surface import shown as _shown
+from jaxrock._core.namespace import shown as _shown
 from jaxrock.hazard.curves import HazardCurve as HazardCurve
 from jaxrock.hazard.explanation import compare_measures as compare_measures
 from jaxrock.hazard.fragility import (

@@ -8,25 +8,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Inexact
 
-from jaxrock._arguments import arguments
-from jaxrock._checks import (
-    Values,
-    as_real,
-    checked,
-    if_known,
-    is_traced,
-    level as at_level,
-    positive,
-    scalar,
-    share,
-)
-from jaxrock._described import described
-from jaxrock._settings import called_by_users
+from jaxrock._arguments.annotations import arguments
+from jaxrock._arguments.ranges import checked, if_known, level as at_level, positive, scalar, share
+from jaxrock._arguments.repr import described
+from jaxrock._core.arrays import Values, as_real, is_traced
+from jaxrock._core.settings import called_by_users
+from jaxrock._core.types import Real, Scalar
 from jaxrock.hazard.fragility import alike, beside, rising, the_one_before
 from jaxrock.numerics.gauss_legendre import gauss_legendre
 
-Real = Inexact[Array, "..."]
-Number = Inexact[Array, ""]
 _ORDER = 20  # nodes of the quadrature between levels
 
 
@@ -109,7 +99,7 @@ class HazardCurve(eqx.Module):
     @called_by_users
     def scaled(self, factor: ArrayLike) -> "HazardCurve":
         """Return the curve of a site where every shaking is `factor` times as intense (positive), with equal rates."""
-        return scaled(self, scalar("factor", positive("factor", factor)))
+        return scaled_curve(self, scalar("factor", positive("factor", factor)))
 
     @called_by_users
     def extended(self, lowest: ArrayLike, highest: ArrayLike) -> "HazardCurve":
@@ -169,7 +159,7 @@ def check_one(curve: HazardCurve) -> None:
         raise ValueError(f"Argument `curve` must be one, but has levels of shape {curve.levels.shape}. Use jax.vmap.")
 
 
-def scaled(curve: HazardCurve, factor: Number) -> HazardCurve:
+def scaled_curve(curve: HazardCurve, factor: Scalar) -> HazardCurve:
     return eqx.tree_at(lambda c: c.levels, curve, curve.levels * factor)
 
 

@@ -5,8 +5,8 @@ from typing import Annotated
 
 import numpy as np
 
-from jaxrock._arguments import arguments, word_of
-from jaxrock._checks import shown
+from jaxrock._arguments.annotations import arguments, word_of
+from jaxrock._core.arrays import shown
 from jaxrock.hazard.fragility import FitStatus
 from jaxrock.hazard.probit import fit_probit
 from jaxrock.hazard.suites import SuiteOutcomes, measures_by_name

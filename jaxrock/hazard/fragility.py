@@ -9,30 +9,19 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Inexact
 
-from jaxrock._arguments import arguments
-from jaxrock._checks import (
-    Values,
-    as_real,
-    check_shapes,
-    checked,
-    if_known,
-    is_traced,
-    level as at_level,
-    not_negative,
-    one_program,
-    positive,
-    share,
-)
-from jaxrock._described import described
-from jaxrock._parameters import Owner, parameter, set_parameters
-from jaxrock._quickly import quickly
-from jaxrock._settings import called_by_users
-from jaxrock._tables import AbstractTable, Column, scenes
-from jaxrock.hazard.probit_line import probit, probit_line, slope_tests, with_room
+from jaxrock._arguments.annotations import arguments
+from jaxrock._arguments.parameters import Owner, parameter, set_parameters
+from jaxrock._arguments.ranges import checked, if_known, level as at_level, not_negative, positive, share
+from jaxrock._arguments.repr import described
+from jaxrock._arguments.tables import AbstractTable, Column, scenes
+from jaxrock._core.arrays import Values, as_real, check_shapes, is_traced
+from jaxrock._core.one_program import one_program
+from jaxrock._core.settings import called_by_users
+from jaxrock._core.types import Real
+from jaxrock.compiler.hints import jit_low_effort
+from jaxrock.hazard.probit_line import padded_counts, probit, probit_line, slope_tests
 from jaxrock.motions.measures import are_different
 from jaxrock.status import Enumeration, item
-
-Real = Inexact[Array, "..."]
 
 
 class AbstractFragility(Owner):
@@ -278,7 +267,7 @@ def fit_fragility(levels: Values, toppled: Values, trials: Values = 1) -> Fragil
     **Source:** Silvapulle (1981), when the maximum exists; Baker (2015), the fit to counts at levels.
     """
     levels, toppled, survived = counted(levels, toppled, trials)
-    (levels,), toppled, survived, _ = with_room([levels], toppled, survived)
+    (levels,), toppled, survived, _ = padded_counts([levels], toppled, survived)
     return _fit(levels, toppled, survived)
 
 
@@ -294,7 +283,7 @@ def counted(levels: Values, toppled: Values, trials: Values) -> tuple[Real, Real
     return levels, toppled, trials - toppled
 
 
-@quickly()
+@jit_low_effort()
 def _fit(levels, toppled, survived) -> FragilityFit:
     highest_survived, highest_toppled = (jnp.max(jnp.where(n > 0, levels, 0.0)) for n in (survived, toppled))
     lowest_survived, lowest_toppled = (jnp.min(jnp.where(n > 0, levels, jnp.inf)) for n in (survived, toppled))

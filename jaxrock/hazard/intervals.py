@@ -16,9 +16,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from jaxrock._arguments import arguments
-from jaxrock._checks import Values, inner_share, scalar
-from jaxrock._tables import AbstractTable, Column
+from jaxrock._arguments.annotations import arguments
+from jaxrock._arguments.ranges import inner_share, scalar
+from jaxrock._arguments.tables import AbstractTable, Column
+from jaxrock._core.arrays import Values
 from jaxrock.hazard.fragility import FitStatus, counted
 
 _FLATTEST = -9.0  # ln of the least slope that is distinguished from 0, times the spread of the levels

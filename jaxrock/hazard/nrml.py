@@ -6,9 +6,9 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from jaxrock._arguments import arguments, path_of
-from jaxrock._aside import written_aside
-from jaxrock._checks import shown
+from jaxrock._arguments.annotations import arguments, path_of
+from jaxrock._core.arrays import shown
+from jaxrock._core.atomic_files import written_atomically
 from jaxrock.hazard.fragility import LogNormalFragility, TabulatedFragility, check_measure
 from jaxrock.hazard.openquake import units_of_openquake
 
@@ -61,7 +61,7 @@ def write_nrml(
     ElementTree.SubElement(model, "limitStates").text = " ".join(name.replace(" ", "_") for name in fragilities)
     (_continuous if kinds == {LogNormalFragility} else _discrete)(model, fragilities, measure, taxonomy)
     ElementTree.indent(root)
-    with written_aside(path_of("path", path), replace=True) as aside:
+    with written_atomically(path_of("path", path), replace=True) as aside:
         ElementTree.ElementTree(root).write(aside, encoding="utf-8", xml_declaration=True)
 
 

@@ -10,10 +10,11 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Inexact
 
-from jaxrock._arguments import arguments, list_of, path_of
-from jaxrock._checks import is_traced, placed, whole
-from jaxrock._described import described
-from jaxrock._text import check_end, file_error, text_lines
+from jaxrock._arguments.annotations import arguments, list_of, path_of
+from jaxrock._arguments.ranges import whole
+from jaxrock._arguments.repr import described
+from jaxrock._core.arrays import is_traced, to_device
+from jaxrock._core.text import check_end, file_error, text_lines
 from jaxrock.blocks.rigid import GRAVITY
 from jaxrock.hazard.curves import HazardCurve
 
@@ -112,7 +113,7 @@ def read_hazard_curves(paths: str | os.PathLike | Sequence[str | os.PathLike]) -
     levels = first["levels"] / units_of_openquake(first["measure"])
     curves = HazardCurve(np.broadcast_to(levels, rates.shape), rates, first["measure"])
     kinds = tuple(file["kind"] for file in files)
-    longitude, latitude, depth = placed(list(np.asarray(first["positions"]).T))
+    longitude, latitude, depth = to_device(list(np.asarray(first["positions"]).T))
     return HazardCurves(curves, longitude, latitude, depth, kinds=kinds, names=tuple(first["names"]))
 
 

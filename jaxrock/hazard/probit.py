@@ -10,13 +10,15 @@ import numpy as np
 from jax.scipy.special import ndtr
 from jaxtyping import Array, Bool, Float
 
-from jaxrock._arguments import arguments, word_of
-from jaxrock._checks import Values, is_traced, not_negative, one_program, positive, shown
-from jaxrock._quickly import quickly
-from jaxrock._settings import called_by_users
-from jaxrock._tables import AbstractTable, Column
+from jaxrock._arguments.annotations import arguments, word_of
+from jaxrock._arguments.ranges import not_negative, positive
+from jaxrock._arguments.tables import AbstractTable, Column
+from jaxrock._core.arrays import Values, is_traced, shown
+from jaxrock._core.one_program import one_program
+from jaxrock._core.settings import called_by_users
+from jaxrock.compiler.hints import jit_low_effort
 from jaxrock.hazard.fragility import FitStatus, LogNormalFragility, outcomes
-from jaxrock.hazard.probit_line import most_clusters, probit, probit_line, slope_tests, with_room
+from jaxrock.hazard.probit_line import most_clusters, padded_counts, probit, probit_line, slope_tests
 
 
 class ProbitFit(AbstractTable):
@@ -142,7 +144,7 @@ def fit_probit(
     if errors != "information" and labels.max() < 1:
         raise ValueError("Argument `clusters` must name at least two clusters, but names one.")
     count = 0 if errors == "information" else int(labels.max()) + 1
-    lists, toppled, survived, labels = with_room(lists, toppled, trials - toppled, labels)
+    lists, toppled, survived, labels = padded_counts(lists, toppled, trials - toppled, labels)
     logarithms = _logarithms(lists)
     numbers = _fit(logarithms, toppled, survived, labels, count, most_clusters(count), errors)
     return or_separable(ProbitFit(tuple(measures), *numbers), logarithms, toppled, survived)
@@ -185,7 +187,7 @@ def inverse_information(rows, curvature, trials):
     return covariance, (even > 0) & (even < jnp.finfo(rows.dtype).eps ** -0.75)
 
 
-@quickly(static_argnames=("most", "errors"))
+@jit_low_effort(static_argnames=("most", "errors"))
 def _fit(logarithms, toppled, survived, labels, count, most: int, errors: str):
     centre, size = jnp.mean(logarithms, 1), jnp.std(logarithms, 1)
     known = jnp.all(size > 1e-9)

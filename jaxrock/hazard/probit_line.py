@@ -7,27 +7,27 @@ import jax.numpy as jnp
 import numpy as np
 from jax.scipy.special import log_ndtr
 
-from jaxrock._checks import is_at_hand, placed
-from jaxrock.transforms.elementwise import room_for
+from jaxrock._core.arrays import is_concrete, to_device
+from jaxrock.compiler.hints import padded_size
 
 
-def with_room(lists, toppled, survived, labels=None):
+def padded_counts(lists, toppled, survived, labels=None):
     """Pad concrete lists, counts of toppled and survived, and labels with rows whose counts are zero.
 
     Padding to few common lengths lets a few compiled programs serve fits of all lengths. Inputs that are traced, or on
     a device, return unchanged.
     """
-    if not is_at_hand((lists, toppled, survived)):
+    if not is_concrete((lists, toppled, survived)):
         return lists, toppled, survived, labels
-    more = (0, room_for(np.size(toppled)) - np.size(toppled))
+    more = (0, padded_size(np.size(toppled)) - np.size(toppled))
     lists = [np.pad(np.asarray(x), more, "edge") for x in lists]
     counts = (np.pad(np.asarray(x), more) for x in (toppled, survived))
-    return *placed((lists, *counts)), None if labels is None else placed(np.pad(np.asarray(labels), more))
+    return *to_device((lists, *counts)), None if labels is None else to_device(np.pad(np.asarray(labels), more))
 
 
 def most_clusters(count: int) -> int:
     """Return the padded number of clusters; clusters without a row change nothing."""
-    return room_for(count) if count else 0
+    return padded_size(count) if count else 0
 
 
 def probit(z, toppled, survived):

@@ -14,13 +14,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int8
 
-from jaxrock._arguments import arguments, word_of
-from jaxrock._checks import Values, checked, one_of, placed
-from jaxrock._quickly import quickly
-from jaxrock._settings import called_by_users
-from jaxrock._tables import AbstractTable, Column
+from jaxrock._arguments.annotations import arguments, word_of
+from jaxrock._arguments.ranges import checked, one_of
+from jaxrock._arguments.tables import AbstractTable, Column
+from jaxrock._core.arrays import Values, to_device
+from jaxrock._core.settings import called_by_users
 from jaxrock.blocks.asymmetric import AsymmetricBlock
 from jaxrock.blocks.rigid import Block
+from jaxrock.compiler.hints import jit_low_effort
 from jaxrock.engines.stepper import AbstractEngine
 from jaxrock.hazard.fragility import (
     FragilityFit,
@@ -45,7 +46,7 @@ from jaxrock.studies.suite_scenes import (
     both_ways,
     capacities,
     comes_back,
-    scenes,
+    scenes_of_suite,
     stacked,
 )
 
@@ -154,7 +155,7 @@ class SimulatedFragility(AbstractTable):
         if self._records == 1:
             covariance, test = unknown, unknown[0, 0]
         else:
-            covariance, test = _clustered(fit, self.levels, *placed((toppled, np.asarray(trials))))
+            covariance, test = _clustered(fit, self.levels, *to_device((toppled, np.asarray(trials))))
         if np.all(toppled == toppled[0]):
             covariance = unknown
         fragility = lognormal_of(fit.fragility.median, fit.fragility.dispersion, self.measure)
@@ -226,7 +227,7 @@ class SimulatedFragility(AbstractTable):
         }
 
 
-@quickly()
+@jit_low_effort()
 def _clustered(fit: FragilityFit, levels, toppled, draws):
     """Return the covariance of (ln median, ln dispersion), and the test of the slope, with each record as a cluster."""
     median, dispersion = fit.fragility.median, fit.fragility.dispersion
@@ -288,7 +289,7 @@ def simulated_fragility(
     factors = _factors(levels, strength, power)
     strongest = factors * np.asarray(suite.peak_acceleration)[:, None]
     checked("levels", strongest.max(axis=0), "keep all motions at 1e9 g or below", lambda x: x <= 1e9)
-    found = scenes(stacked(block), suite, both_ways(factors, facing), model, engine, progress)
+    found = scenes_of_suite(stacked(block), suite, both_ways(factors, facing), model, engine, progress)
     peaks, verdict = (suite.peak_acceleration, suite.peak_velocity), as_draws(found.verdict, facing)
     return SimulatedFragility(levels, verdict, *peaks, suite.names, kind.name, strength, power, suite.turns)
 

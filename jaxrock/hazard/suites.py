@@ -13,12 +13,13 @@ import jax
 import numpy as np
 from jaxtyping import Float, Int8
 
-from jaxrock._arguments import arguments, list_of, word_of
-from jaxrock._checks import Values, checked, positive, shown
-from jaxrock._parameters import leaves_of
-from jaxrock._precision import frames_of_the_package
-from jaxrock._settings import called_by_users
-from jaxrock._tables import AbstractTable, Column
+from jaxrock._arguments.annotations import arguments, list_of, word_of
+from jaxrock._arguments.parameters import leaves_of
+from jaxrock._arguments.ranges import checked, positive
+from jaxrock._arguments.tables import AbstractTable, Column
+from jaxrock._core.arrays import Values, shown
+from jaxrock._core.precision import frames_of_the_package
+from jaxrock._core.settings import called_by_users
 from jaxrock.blocks.asymmetric import AsymmetricBlock
 from jaxrock.blocks.rigid import Block
 from jaxrock.engines.stepper import AbstractEngine
@@ -34,7 +35,7 @@ from jaxrock.studies.suite_scenes import (
     comes_back,
     is_symmetric,
     rising_scales,
-    scenes,
+    scenes_of_suite,
     stacked,
 )
 
@@ -196,7 +197,7 @@ def suite_outcomes(
     blocks, ways = stacked(block), FACINGS[facing]
     symmetric = is_symmetric(block)
     factors = np.concatenate([way * scales for way in (ways[:1] if symmetric else ways)])
-    found = scenes(blocks, suite, factors, model, engine, progress)
+    found = scenes_of_suite(blocks, suite, factors, model, engine, progress)
     draws = jax.tree.leaves(blocks)[0].shape[0]
 
     def by_facing(values):

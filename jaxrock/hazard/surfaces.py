@@ -14,26 +14,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Inexact, Int8
 
-from jaxrock._arguments import arguments, list_of, word_of
-from jaxrock._checks import (
-    Values,
-    check_shapes,
-    checked,
-    if_known,
-    inner_share,
-    level,
-    not_negative,
-    one_program,
-    positive,
-    scalar,
-    shown,
-)
-from jaxrock._described import described
-from jaxrock._parameters import one_of_many
-from jaxrock._quickly import quickly
-from jaxrock._settings import called_by_users
+from jaxrock._arguments.annotations import arguments, list_of, word_of
+from jaxrock._arguments.parameters import one_of_many
+from jaxrock._arguments.ranges import checked, if_known, inner_share, level, not_negative, positive, scalar
+from jaxrock._arguments.repr import described
+from jaxrock._core.arrays import Values, check_shapes, shown
+from jaxrock._core.one_program import one_program
+from jaxrock._core.settings import called_by_users
 from jaxrock.blocks.asymmetric import AsymmetricBlock
 from jaxrock.blocks.rigid import GRAVITY, Block
+from jaxrock.compiler.hints import jit_low_effort
 from jaxrock.engines.stepper import AbstractEngine
 from jaxrock.hazard.fragility import (
     FitStatus,
@@ -45,13 +35,13 @@ from jaxrock.hazard.fragility import (
     rising_list,
 )
 from jaxrock.hazard.probit import inverse_information, or_separable
-from jaxrock.hazard.probit_line import most_clusters, probit, probit_line, with_room
+from jaxrock.hazard.probit_line import most_clusters, padded_counts, probit, probit_line
 from jaxrock.hazard.simulation import SimulatedFragility, counts
 from jaxrock.models.equation import AbstractEquation
 from jaxrock.models.rigid import Housner
 from jaxrock.motions.intensity import peak_acceleration, peak_velocity
+from jaxrock.motions.mirrored import scaled_and_mirrored
 from jaxrock.motions.motion import AbstractMotion
-from jaxrock.motions.turned import felt
 from jaxrock.responses.current_model import current_model
 from jaxrock.responses.outcome import outcome
 from jaxrock.status import Status
@@ -161,7 +151,7 @@ def fit_surface(
     count = int(labels.max()) + 1
     if count < 2:
         raise ValueError("Argument `clusters` must name at least two clusters, but names one.")
-    both, toppled, survived, labels = with_room([acceleration, ratio], toppled, trials - toppled, labels)
+    both, toppled, survived, labels = padded_counts([acceleration, ratio], toppled, trials - toppled, labels)
     acceleration, ratio = both
     fit, scores, measures = _fit(acceleration, ratio, toppled, survived)
     fit = or_separable(fit, measures, toppled, survived)
@@ -171,13 +161,13 @@ def fit_surface(
     return eqx.tree_at(lambda f: f.covariance, fit, covariance)
 
 
-@quickly(static_argnames="most")
+@jit_low_effort(static_argnames="most")
 def _clustered(covariance, scores, labels, count: ArrayLike, most: int) -> Float[Array, "3 3"]:
     summed = jnp.zeros((most, 3)).at[labels].add(scores)
     return covariance @ (summed.T @ summed * count / (count - 1)) @ covariance
 
 
-@quickly()
+@jit_low_effort()
 def _fit(acceleration, ratio, toppled, survived):
     """Return the fit, the scores of all outcomes, and the logarithms of the measures.
 
@@ -384,6 +374,6 @@ def _verdicts(
 def _verdict(index, draw, factor, scene):
     blocks, group, model, engine = scene
     motion = jax.tree.map(lambda x: x[index], group)  # `jax.vmap` gave every leaf, also shared ones, a leading axis
-    result = outcome(one_of_many(blocks, draw), felt(motion, factor), model, engine=engine)
+    result = outcome(one_of_many(blocks, draw), scaled_and_mirrored(motion, factor), model, engine=engine)
     verdict = jnp.where(result.overturned, TOPPLED, STOOD)
     return jnp.where(result.status == Status.successful, verdict, UNDECIDED).astype(jnp.int8)

@@ -16,14 +16,15 @@ import numpy as np
 from jax.scipy.special import log_ndtr
 from jaxtyping import Array, ArrayLike, Inexact, PyTree
 
-from jaxrock._arguments import arguments, list_of
-from jaxrock._checks import Values, checked, inner_share, not_negative, placed, scalar, share
-from jaxrock._quickly import quickly
-from jaxrock.hazard.curves import HazardCurve, check_one, power_laws, scaled, shakings
+from jaxrock._arguments.annotations import arguments, list_of
+from jaxrock._arguments.ranges import checked, inner_share, not_negative, scalar, share
+from jaxrock._core.arrays import Values, to_device
+from jaxrock._core.types import Scalar
+from jaxrock.compiler.hints import jit_low_effort
+from jaxrock.hazard.curves import HazardCurve, check_one, power_laws, scaled_curve, shakings
 from jaxrock.hazard.fragility import AbstractFragility, LogNormalFragility, check_measure
 from jaxrock.numerics.roots import search_root
 
-Number = Inexact[Array, ""]
 _each = list_of(AbstractFragility, "fragilities")
 
 
@@ -46,7 +47,7 @@ def _check(fragilities: Fragilities, curve: HazardCurve) -> None:
 
 
 @arguments
-def toppling_rate(fragility: AbstractFragility, curve: HazardCurve) -> Number:
+def toppling_rate(fragility: AbstractFragility, curve: HazardCurve) -> Scalar:
     """Return the annual rate of shakings that topple a rock: the fragility integrated over the hazard curve's rates.
 
     **Arguments:**
@@ -67,7 +68,7 @@ def toppling_rate(fragility: AbstractFragility, curve: HazardCurve) -> Number:
 
 
 @arguments
-def survival_probability(fragilities: Fragilities, ages: Values, curve: HazardCurve) -> Number:
+def survival_probability(fragilities: Fragilities, ages: Values, curve: HazardCurve) -> Scalar:
     """Return the probability that all rocks of a site have stood since they became fragile, under shared shakings.
 
     At each time before present only rocks that were already fragile count. The rate of shakings that topple at least
@@ -115,7 +116,7 @@ def branch_weights(prior: Values, survival: Values) -> Inexact[Array, " branches
 
 
 @arguments
-def allowed_scale(fragilities: Fragilities, ages: Values, curve: HazardCurve, probability: ArrayLike = 0.05) -> Number:
+def allowed_scale(fragilities: Fragilities, ages: Values, curve: HazardCurve, probability: ArrayLike = 0.05) -> Scalar:
     """Return the factor on the intensity of all shakings at which the survival of all rocks has a given probability.
 
     Larger factors are rejected with the confidence 1 - `probability`. The factor scales the levels of the curve, and
@@ -165,25 +166,25 @@ def _rocks(fragilities: Fragilities, ages: Values) -> tuple[tuple[_Stack, ...], 
         numbers, rest = eqx.partition([rocks[index] for index in members], eqx.is_array_like)
         stacks.append((eqx.combine(jax.tree.map(_stacked, *numbers), rest[0]), len(members)))
     order = np.concatenate(list(kinds.values()))
-    return tuple(stacks), ages[order] if isinstance(ages, jax.core.Tracer) else placed(ages[order])
+    return tuple(stacks), ages[order] if isinstance(ages, jax.core.Tracer) else to_device(ages[order])
 
 
 def _stacked(*numbers: Any) -> Array:
     """Stack numbers; concrete ones by NumPy, because JAX would compile a program for every number of rocks."""
     if any(isinstance(number, jax.core.Tracer) for number in numbers):
         return jnp.stack(numbers)
-    return placed(np.stack([np.asarray(number) for number in numbers]))
+    return to_device(np.stack([np.asarray(number) for number in numbers]))
 
 
-@quickly(eqx.filter_jit)
-def _toppling_rate(fragility: AbstractFragility, curve: HazardCurve) -> Number:
+@jit_low_effort(eqx.filter_jit)
+def _toppling_rate(fragility: AbstractFragility, curve: HazardCurve) -> Scalar:
     if type(fragility) is LogNormalFragility:  # a subclass may have other probabilities
         return _lognormal_rate(fragility, curve)
     levels, rates = shakings(curve, fragility.knots)
     return rates @ fragility(levels)
 
 
-def _lognormal_rate(fragility: LogNormalFragility, curve: HazardCurve) -> Number:
+def _lognormal_rate(fragility: LogNormalFragility, curve: HazardCurve) -> Scalar:
     """Return the toppling rate in closed form, integrated by parts.
 
     It is the rate at the first known level times the fragility there, plus the integral of the rate over the fragility.
@@ -206,8 +207,8 @@ def _lognormal_rate(fragility: LogNormalFragility, curve: HazardCurve) -> Number
     return within + jnp.where(first, curve.rates, 0.0) @ fragility(curve.levels)
 
 
-@quickly(eqx.filter_jit)
-def _topplings(rocks: tuple[_Stack, ...], ages: Inexact[Array, " rocks"], curve: HazardCurve) -> Number:
+@jit_low_effort(eqx.filter_jit)
+def _topplings(rocks: tuple[_Stack, ...], ages: Inexact[Array, " rocks"], curve: HazardCurve) -> Scalar:
     """Return the expected number of shakings that topple at least one of the rocks that are fragile at that time."""
 
     def of_each(function):
@@ -224,20 +225,20 @@ def _topplings(rocks: tuple[_Stack, ...], ages: Inexact[Array, " rocks"], curve:
     return (ages - jnp.append(ages[1:], 0.0)) @ (joint @ rates)
 
 
-@quickly(eqx.filter_jit)
-def _allowed_scale(rocks, ages, curve, most: Number) -> Number:
+@jit_low_effort(eqx.filter_jit)
+def _allowed_scale(rocks, ages, curve, most: Scalar) -> Scalar:
     """Return the factor of `allowed_scale`, at which `most` topplings are expected."""
     numbers, rest = eqx.partition((rocks, ages, curve, most), eqx.is_array)
 
     def excess(logarithm, numbers):
         rocks, ages, curve, most = eqx.combine(numbers, rest)
-        return _topplings(rocks, ages, scaled(curve, jnp.exp(logarithm))) - most
+        return _topplings(rocks, ages, scaled_curve(curve, jnp.exp(logarithm))) - most
 
     return _first_factor(excess, numbers)
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _first_factor(excess: Callable, numbers: PyTree) -> Number:
+def _first_factor(excess: Callable, numbers: PyTree) -> Scalar:
     """Return the first factor at which `excess(ln factor, numbers)` is not negative."""
     grid = jnp.log(jnp.asarray(_FACTORS, jnp.result_type(float)))
     reached = jax.lax.map(lambda logarithm: excess(logarithm, numbers), grid) >= 0

@@ -4,7 +4,7 @@ Holds likelihoods, estimates, posterior samples and regions of allowed motions. 
 `responses`. Start reading with `likelihood`, then `estimate`.
 """
 
-from jaxrock._surface import shown as _shown
+from jaxrock._core.namespace import shown as _shown
 from jaxrock.inverse.block_calibration import (
     BlockCalibration as BlockCalibration,
     CalibrationStatus as CalibrationStatus,

@@ -14,20 +14,21 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from jaxrock._arguments import arguments, at_least, known, list_of
-from jaxrock._checks import Range, Values, as_real, below_one, share, shown, whole
-from jaxrock._quickly import quickly
-from jaxrock._settings import called_by_users
-from jaxrock._tables import AbstractTable, Column
+from jaxrock._arguments.annotations import arguments, at_least, known, list_of
+from jaxrock._arguments.ranges import Range, below_one, share, whole
+from jaxrock._arguments.tables import AbstractTable, Column
+from jaxrock._core.arrays import Values, as_real, shown
+from jaxrock._core.settings import called_by_users
+from jaxrock.compiler.hints import jit_low_effort
 from jaxrock.engines.stepper import AbstractEngine
-from jaxrock.inverse.calibration_grid import STILL, Axis, Table, blocks_of_cells, weighed
+from jaxrock.inverse.calibration_grid import LEAST_SEEN, Axis, Table, blocks_of_cells, weighed
 from jaxrock.inverse.unknowns import Unknown
 from jaxrock.models.equation import AbstractEquation
 from jaxrock.models.rigid import Housner
 from jaxrock.motions.motion import AbstractMotion
 from jaxrock.motions.suite import Suite
 from jaxrock.status import Enumeration, item
-from jaxrock.studies.suite_scenes import scenes
+from jaxrock.studies.suite_scenes import scenes_of_suite
 
 _LEAST_BEND = 1e-8  # least curvature of the likelihood, in squared ranges; anything smaller is rounding
 _deviation = Range("be in (0, 1]", 0.0, 1.0, lambda x: (x > 0) & (x <= 1))
@@ -239,7 +240,7 @@ def calibrate_block(
     places = {name: places[name] for name in sorted(places)}  # as JAX orders what a program is given
     seen, ways, told = _tests(len(suite), toppled, facing, rotation)
     lanes, dealt = blocks_of_cells(block, axes), _dealt(groups, len(suite), folds)
-    found = scenes(
+    found = scenes_of_suite(
         lanes, suite, np.array([1.0, -1.0]) if (ways <= 0).any() else np.array([1.0]), model, engine, progress
     )
     table = Table.of(found, seen, ways, told, rotation_sd, tuple(axis.count for axis in axes.values()))
@@ -280,8 +281,8 @@ def _tests(count: int, toppled, facing, rotation) -> tuple[np.ndarray, np.ndarra
     if rotation is None:
         return seen, ways, None
     told = np.asarray(as_real("rotation", rotation), float)
-    if told.shape != (count,) or not (np.isnan(told) | (told == 0) | (told >= STILL)).all():
-        raise ValueError(f"Argument `rotation` must hold 0, {STILL} or more, or NaN for each of {count} tests.")
+    if told.shape != (count,) or not (np.isnan(told) | (told == 0) | (told >= LEAST_SEEN)).all():
+        raise ValueError(f"Argument `rotation` must hold 0, {LEAST_SEEN} or more, or NaN for each of {count} tests.")
     if (np.isfinite(told) & (seen == 1)).any():
         raise ValueError("Argument `rotation` must be NaN for tests that toppled.")
     return seen, ways, told
@@ -374,26 +375,26 @@ def climbed(problem: _Problem, starts: list[np.ndarray], weights=None) -> tuple[
     return best.x, bool(best.success) or float(np.abs(best.jac).max()) < 1e-3
 
 
-@quickly(follows_scenes=True)
+@jit_low_effort(follows_scenes=True)
 def _density(problem, values):
     return problem.log_density(jnp.stack([problem.place(name, values[name]) for name in problem.unknowns]))
 
 
-@quickly(follows_scenes=True)
+@jit_low_effort(follows_scenes=True)
 def _heights(problem, points):
     return jax.lax.map(problem.log_density, points)
 
 
-@quickly(follows_scenes=True)
+@jit_low_effort(follows_scenes=True)
 def _value(problem, place, weights):
     return jax.value_and_grad(lambda x: problem.log_density(x, weights))(place)
 
 
-@quickly(follows_scenes=True)
+@jit_low_effort(follows_scenes=True)
 def _probabilities(problem, place, shares):
     return problem.probabilities(place, shares)
 
 
-@quickly(follows_scenes=True)
+@jit_low_effort(follows_scenes=True)
 def _hessian(problem, place):
     return jax.hessian(problem.log_density)(place)

@@ -10,14 +10,14 @@ import numpy as np
 from jax.scipy.special import ndtr
 from jaxtyping import Array, Float
 
-from jaxrock._parameters import leaves_of, shared
+from jaxrock._arguments.parameters import leaves_of, shared
+from jaxrock.compiler import checks
 from jaxrock.inverse.unknowns import Unknown
 from jaxrock.studies.suite_scenes import TOPPLED, UNDECIDED, Scenes
-from jaxrock.transforms.fingerprint import with_checks
 
 # Limits of the usual parameters (Housner's restitution does not exist for wider blocks).
 _LIMITS = dict.fromkeys(("alpha", "alpha1", "alpha2"), (1e-3, 0.9)) | {"restitution": (0.0, 1.0)}
-STILL = 0.01  # peak rotation over slenderness below which an observer sees no motion
+LEAST_SEEN = 0.01  # peak rotation over slenderness below which an observer sees no motion
 _BEYOND = 2.5  # standard deviations by which the grid extends beyond the range of a median
 
 
@@ -92,7 +92,7 @@ class Axis(eqx.Module):
 def blocks_of_cells(block: Callable, axes: dict[str, Axis]) -> Any:
     """Return the blocks of all cells, the last parameter changing fastest; shared leaves are stored once."""
     grid = np.meshgrid(*(axis.values for axis in axes.values()), indexing="ij")
-    made = with_checks(lambda *each: block(**dict(zip(axes, each))))
+    made = checks.with_checks(lambda *each: block(**dict(zip(axes, each))))
     try:
         found = jax.vmap(made)(*(jnp.asarray(x.ravel()) for x in grid))
     except TypeError as error:
@@ -162,7 +162,7 @@ class Table(eqx.Module):
             with np.errstate(all="ignore"):
                 off = (np.log(told)[:, None, None] - np.log(found.rotation)) / deviation
                 density = np.exp(-(off**2) / 2) / (deviation * np.sqrt(2 * np.pi))
-            still = found.rotation < STILL
+            still = found.rotation < LEAST_SEEN
             density = mean(np.where((told == 0)[:, None, None], still, np.where(still, 0.0, np.nan_to_num(density))))
         return cls(jnp.asarray(seen), (lower + upper) / 2, lower, upper, density, has)
 

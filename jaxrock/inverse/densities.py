@@ -9,18 +9,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Inexact
 
-from jaxrock._arguments import arguments, at_least
-from jaxrock._checks import as_real, check_shapes
-from jaxrock._quickly import quickly
-from jaxrock._settings import called_by_users
+from jaxrock._arguments.annotations import arguments, at_least
+from jaxrock._core.arrays import as_real, check_shapes
+from jaxrock._core.settings import called_by_users
+from jaxrock._core.types import Real
+from jaxrock.compiler.hints import jit_low_effort
 from jaxrock.engines.stepper import AbstractEngine
 from jaxrock.inverse.likelihood import Likelihood, quadrature_accuracy
 from jaxrock.inverse.observations import Observations
 from jaxrock.inverse.unknowns import Problem, Unknown
 from jaxrock.models.equation import AbstractEquation
 from jaxrock.models.rigid import Housner
-
-Real = Inexact[Array, "..."]
 
 
 class LogDensity(eqx.Module):
@@ -98,7 +97,7 @@ class LogDensity(eqx.Module):
         return jnp.sum(jax.nn.log_sigmoid(point) + jax.nn.log_sigmoid(-point), axis=-1)
 
 
-@quickly(eqx.filter_jit, follows_scenes=True)
+@jit_low_effort(eqx.filter_jit, follows_scenes=True)
 def _at_points(density: LogDensity, point: Real, by_point: Bool[ArrayLike, ""]) -> Real:
     """Return the log-density or, if not `by_point`, the objective; one compiled program serves both."""
     problem = density.problem

@@ -14,25 +14,25 @@ from typing import Annotated, Any
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Array, ArrayLike, Bool, Inexact
+from jaxtyping import Array, ArrayLike, Bool
 
-from jaxrock._arguments import arguments, at_least
-from jaxrock._checks import placed
-from jaxrock._progress import Progress
-from jaxrock._tables import AbstractTable, Column
+from jaxrock._arguments.annotations import arguments, at_least
+from jaxrock._arguments.tables import AbstractTable, Column
+from jaxrock._core.arrays import to_device
+from jaxrock._core.progress import Progress
+from jaxrock._core.types import Real
 from jaxrock.engines.stepper import AbstractEngine
 from jaxrock.inverse.likelihood import Likelihood, quadrature_accuracy
-from jaxrock.inverse.observations import ROTATION, TOPPLED, Observations
+from jaxrock.inverse.observations import SEEN_ROTATION, SEEN_TOPPLED, Observations
 from jaxrock.inverse.profile_likelihood import Profile, Shape, profile, shape_at
 from jaxrock.inverse.scan import Competing, competing, scan, spread, starts as starts_of
 from jaxrock.inverse.search import Trace, optimizer_or_none, summits_of
 from jaxrock.inverse.unknowns import Evaluator, Problem, Unknown
 from jaxrock.models.equation import AbstractEquation
 from jaxrock.models.rigid import Housner
-from jaxrock.numerics.climb import Summits, climb
+from jaxrock.numerics.batched_bfgs import Summits, batched_bfgs
 from jaxrock.status import Enumeration, item
 
-Real = Inexact[Array, "..."]
 _SCANNED, _LEAST_SCANNED = 16, 256  # places of the scan for each start; least number of places
 _ROUNDS_BESIDE, _SCANNED_BESIDE, _BESIDE = 3, 128, 0.08  # rounds, points in each, and their extent in ranges
 _CLIMBING_BESIDE = 8  # climbers started from these points
@@ -211,7 +211,7 @@ def estimate_motion(
         if profiled.better is None:
             break
         # Climbing along a profile has crossed to a higher summit.
-        summits = _joined(climb(evaluate, profiled.better[None]), summits)
+        summits = _joined(batched_bfgs(evaluate, profiled.better[None]), summits)
     result = _conclude(evaluate, summits, shape, profiled, trace)
     bar.add(bar.total - bar.done)
     return result
@@ -242,7 +242,7 @@ def _conclude(evaluate: Evaluator, summits: Summits, shape: Shape, profiled: Pro
     logs = np.array([unknown.log for unknown in problem.unknowns.values()])
     stands, computed, *facts = evaluate.facts(evaluate.places(summits.points[best]))
     surprise = _surprise(facts)
-    probability = np.where(np.asarray(problem.likelihood.observations.seen) == TOPPLED, 1 - stands, stands)
+    probability = np.where(np.asarray(problem.likelihood.observations.seen) == SEEN_TOPPLED, 1 - stands, stands)
     others, errors = competing(evaluate, summits), evaluate.errors(evaluate.places(summits.points[best]))
     remarks, consistent = _remarks(problem, shape, profiled, others, errors[1]), np.inf
     status = EstimateStatus.several_maxima if len(others.values) else EstimateStatus.successful
@@ -274,7 +274,7 @@ def _conclude(evaluate: Evaluator, summits: Summits, shape: Shape, profiled: Pro
         "competing_values": others.values, "probability_error": errors[0], "log_likelihood_error": errors[1],
     }  # fmt: skip
     return Estimate(
-        **placed({name: np.asarray(x) for name, x in arrays.items()}),
+        **to_device({name: np.asarray(x) for name, x in arrays.items()}),
         names=problem.names,
         scatter=problem.likelihood.scatter,
         trace=trace,
@@ -299,7 +299,7 @@ def _worst(likelihood: Likelihood, probability: np.ndarray, stands: np.ndarray, 
     away = np.sqrt(np.maximum(2 * (badness + np.log((1 - lapse) * stands + lapse / 2)), 0.0))
 
     def told(rock):
-        if seen.seen[rock] == ROTATION:
+        if seen.seen[rock] == SEEN_ROTATION:
             return f"{seen.names[rock]} (its rotation is off by {away[rock]:.1f} standard deviations)"
         return f"{seen.names[rock]} ({probability[rock]:.1g})"
 
@@ -315,7 +315,7 @@ def _consistent(evaluate: Evaluator, point: np.ndarray) -> float:
         again = Evaluator(problem)
         scan(again, _LEAST_SCANNED)
         starts = np.concatenate([point[None], starts_of(again, _RETRIES)])
-        summits = climb(again, starts)
+        summits = batched_bfgs(again, starts)
         evaluate.count += again.scenes // evaluate.problem.likelihood.scenes
         if _surprise(again.facts(again.places(summits.points[np.argmax(summits.values)]))[2:]) <= _SURPRISED:
             return float(scatter)

@@ -9,20 +9,21 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
-from jaxrock._arguments import arguments, pair
-from jaxrock._checks import Values, finite, placed, scalar, shown, size
-from jaxrock._parameters import shared
-from jaxrock._progress import Progress
-from jaxrock._tables import AbstractTable, Column
+from jaxrock._arguments.annotations import arguments, pair
+from jaxrock._arguments.parameters import shared
+from jaxrock._arguments.ranges import finite, scalar, size
+from jaxrock._arguments.tables import AbstractTable, Column
+from jaxrock._core.arrays import Values, shown, to_device
+from jaxrock._core.progress import Progress
 from jaxrock.engines.stepper import AbstractEngine
 from jaxrock.inverse.batches import in_batches
 from jaxrock.inverse.likelihood import Likelihood, as_program
-from jaxrock.inverse.observations import TOPPLED, Observations
+from jaxrock.inverse.observations import SEEN_TOPPLED, Observations
 from jaxrock.models.equation import AbstractEquation
 from jaxrock.models.rigid import Housner
+from jaxrock.motions.mirrored import has_vertical, scaled_and_mirrored
 from jaxrock.motions.motion import AbstractMotion
 from jaxrock.motions.pulses import UNITS
-from jaxrock.motions.turned import felt, has_vertical
 from jaxrock.studies.critical import critical_amplitudes
 from jaxrock.studies.parameters import amplitude_of
 from jaxrock.studies.spectra import axis
@@ -90,7 +91,7 @@ def feasible_region(
     total = found.reshape(*(x.size for x in lists.values()))
     # Half the 95 % quantile of chi-square with two degrees of freedom, -ln 0.05.
     (first, second), (across, up) = lists, lists.values()
-    return FeasibleRegion((first, second), (across, up), *placed((total, total > total.max() + np.log(0.05))))
+    return FeasibleRegion((first, second), (across, up), *to_device((total, total > total.max() + np.log(0.05))))
 
 
 class Unexceeded(AbstractTable):
@@ -152,13 +153,13 @@ def unexceeded_motion(
     **Raises:** ValueError for arguments outside their ranges, or if no rock stands.
     """
     durations = axis("durations", durations, size)
-    standing = np.flatnonzero(np.asarray(observations.seen) != TOPPLED)
+    standing = np.flatnonzero(np.asarray(observations.seen) != SEEN_TOPPLED)
     if standing.size == 0:
         raise ValueError("Argument `observations` must hold a rock that stands.")
     seen = observations.of(standing)
     ways, count = np.asarray(seen.ways), durations.size
-    blocks = placed(jax.tree.map(lambda x: np.tile(np.repeat(x, count), len(ways)), seen.blocks))
-    motions, own = _motions(motion, *placed((np.repeat(ways.ravel(), count), np.tile(durations, ways.size))))
+    blocks = to_device(jax.tree.map(lambda x: np.tile(np.repeat(x, count), len(ways)), seen.blocks))
+    motions, own = _motions(motion, *to_device((np.repeat(ways.ravel(), count), np.tile(durations, ways.size))))
     critical = critical_amplitudes(
         blocks,
         motions,
@@ -173,7 +174,7 @@ def unexceeded_motion(
     amplitude = by_rock.min(axis=0)
     weakest = np.where(np.isposinf(amplitude), -1, standing[np.argmin(by_rock, axis=0)])
     complete = np.asarray(critical.complete).reshape(-1, count).all(axis=0) & ~np.isnan(amplitude)
-    return Unexceeded(*placed((np.asarray(durations), amplitude, by_rock, weakest, complete)))
+    return Unexceeded(*to_device((np.asarray(durations), amplitude, by_rock, weakest, complete)))
 
 
 def _motions(motion: Callable, ways: Array, duration: Array) -> tuple[AbstractMotion, Array]:
@@ -188,7 +189,7 @@ def _motions(motion: Callable, ways: Array, duration: Array) -> tuple[AbstractMo
     is_level = not has_vertical(one)
 
     def turned(way, duration):
-        return motion(way, duration) if is_level else felt(motion(jnp.ones_like(way), duration), way)
+        return motion(way, duration) if is_level else scaled_and_mirrored(motion(jnp.ones_like(way), duration), way)
 
     like = eqx.filter_eval_shape(turned, *first)
     axes = jax.tree.map(lambda own: None if own else 0, shared(like))

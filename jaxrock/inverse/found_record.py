@@ -11,26 +11,27 @@ from typing import Annotated, Any, NamedTuple
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import ArrayLike
 
-from jaxrock._arguments import arguments, at_least, gradient_transformation, known, pair
-from jaxrock._checks import Values, finite, not_negative, one_of, placed, positive, scalar, shown
-from jaxrock._parameters import broadcast, leaves_of
-from jaxrock._precision import say_if_single
-from jaxrock._progress import Progress
-from jaxrock._tables import AbstractTable, Column
+from jaxrock._arguments.annotations import arguments, at_least, gradient_transformation, known, pair
+from jaxrock._arguments.parameters import broadcast, leaves_of
+from jaxrock._arguments.ranges import finite, not_negative, one_of, positive, scalar
+from jaxrock._arguments.tables import AbstractTable, Column
+from jaxrock._core.arrays import Values, shown, to_device
+from jaxrock._core.precision import say_if_single
+from jaxrock._core.progress import Progress
+from jaxrock._core.types import Floats
 from jaxrock.blocks.asymmetric import AsymmetricBlock
 from jaxrock.blocks.rigid import Block
 from jaxrock.engines.stepper import AbstractEngine
+from jaxrock.inverse.design_point import Found, Search, Site, allowed_changes, least_change, rms
 from jaxrock.inverse.kept_spectrum import TOLERANCE, KeptSpectrum
-from jaxrock.inverse.nearest_change import Found, Search, Site, allowed_changes, least_change, rms
 from jaxrock.models.equation import AbstractEquation
 from jaxrock.models.rigid import Housner
 from jaxrock.motions.record import Record, record_in_g
 from jaxrock.responses.current_model import current_model
 from jaxrock.status import Enumeration, item
 
-Real = Float[Array, "..."]
 Target = str | ArrayLike | Sequence[str | float]
 _ROUNDS = 6  # rounds of the search; each constrains the spectral peaks that grew in the preceding round
 _APPROACH = 40  # largest number of steps of the optimiser
@@ -81,13 +82,13 @@ class FoundRecord(AbstractTable):
 
     record: Record
     start: Record
-    change: Real
-    scaling: Real
-    margin: Real
-    slope: Real
-    changes: Real
-    path: Real
-    spectrum: Real
+    change: Floats
+    scaling: Floats
+    margin: Floats
+    slope: Floats
+    changes: Floats
+    path: Floats
+    spectrum: Floats
     status: RecordStatus
 
     @property
@@ -235,11 +236,11 @@ def _site(block, start: Record, target, model: AbstractEquation, engine: Abstrac
             one_of("target", each, tuple(_SIDES))
     wanted = np.array([0.0 if isinstance(x, str) else float(scalar("target", finite("target", x))) for x in targets])
     model = current_model(model, blocks, start)
-    site = Site(blocks, start.samples, start.dt, placed(np.ones(count)), placed(wanted), model, engine)
+    site = Site(blocks, start.samples, start.dt, to_device(np.ones(count)), to_device(wanted), model, engine)
     margin = site.margins(np.zeros((1, start.samples.size)))[0][0]
     from_above = margin > wanted
     sides = [_SIDES[x] if isinstance(x, str) else 1.0 if above else -1.0 for x, above in zip(targets, from_above)]
-    return eqx.tree_at(lambda it: it.side, site, placed(np.array(sides)))
+    return eqx.tree_at(lambda it: it.side, site, to_device(np.array(sides)))
 
 
 class _Directions(NamedTuple):
@@ -324,5 +325,5 @@ def _result(
         record=start if found is None else record_in_g(start.samples + change, start.dt, name),
         start=start,
         status=status,
-        **placed({name: np.asarray(x) for name, x in numbers.items()}),
+        **to_device({name: np.asarray(x) for name, x in numbers.items()}),
     )

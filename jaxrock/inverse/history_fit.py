@@ -13,18 +13,19 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from jaxrock._arguments import arguments, at_least, list_of, pair
-from jaxrock._checks import Values, finite, inner_share, not_negative, positive, scalar
-from jaxrock._settings import called_by_users
-from jaxrock._tables import AbstractTable, Column
+from jaxrock._arguments.annotations import arguments, at_least, list_of, pair
+from jaxrock._arguments.ranges import finite, inner_share, not_negative, positive, scalar
+from jaxrock._arguments.tables import AbstractTable, Column
+from jaxrock._core.arrays import Values
+from jaxrock._core.settings import called_by_users
 from jaxrock.blocks.asymmetric import AsymmetricBlock
 from jaxrock.blocks.rigid import Block
 from jaxrock.engines.stepper import AbstractEngine
-from jaxrock.inverse.history_scene import FittedScene, history
+from jaxrock.inverse.history_scene import FittedScene, rotation_history
 from jaxrock.models.equation import AbstractEquation
 from jaxrock.models.rigid import Housner
 from jaxrock.motions.motion import AbstractMotion
-from jaxrock.numerics.least_squares import Covariance, Minimum, Problem, Progression, covariance, least_squares
+from jaxrock.numerics.least_squares import Covariance, LeastSquares, Minimum, Progression, covariance, least_squares
 from jaxrock.status import Enumeration, item
 
 _GROWTH = 1.6  # ratio of the lengths of consecutive windows
@@ -180,7 +181,7 @@ def fit_history(
 
     def at(point: np.ndarray, samples: int):
         """Return weighted residuals and their derivatives in a window of the data."""
-        fitted, slopes, known = map(np.asarray, history(jnp.asarray(point), time, time[samples - 1], scene))
+        fitted, slopes, known = map(np.asarray, rotation_history(jnp.asarray(point), time, time[samples - 1], scene))
         inside = np.where(places < samples, weight, 0.0)
         residuals = np.where(inside > 0, (rotation - fitted) * inside, 0.0)
         return np.where(known, residuals, np.inf), -slopes * inside[:, None]
@@ -189,7 +190,7 @@ def fit_history(
     if not ((lower < first) & (first < upper)).all():
         outside = scene.names[int(np.argmin((lower < first) & (first < upper)))]
         raise ValueError(f"Parameter `{outside}` can be fitted only from within its range, not from its end.")
-    problem = Problem(at, scale, lower, upper)
+    problem = LeastSquares(at, scale, lower, upper)
     progression = Progression(_windows(time.size, first.size), spread, float(_noise(rotation) * np.median(weight)))
     minimum = least_squares(problem, first, progression, starts, seed)
     return _fit(scene, minimum, covariance(minimum, scale, scatter is not None), problem, rotation, weight, scatter)
@@ -261,7 +262,7 @@ def _fit(scene: FittedScene, minimum: Minimum, spread: Covariance, problem, rota
     )
 
 
-def _judged(scene: FittedScene, minimum: Minimum, spread: Covariance, problem: Problem, correlated, scatter):
+def _judged(scene: FittedScene, minimum: Minimum, spread: Covariance, problem: LeastSquares, correlated, scatter):
     """Return the status, and warnings in words."""
     size, count = minimum.residuals.size, minimum.point.size
     warnings = []

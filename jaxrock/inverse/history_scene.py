@@ -9,11 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from jaxrock._checks import put_down
-from jaxrock._parameters import Parameter, check_single
-from jaxrock._quickly import quickly
+from jaxrock._arguments.parameters import Parameter, check_single
 from jaxrock.blocks.asymmetric import AsymmetricBlock
 from jaxrock.blocks.rigid import Block
+from jaxrock.compiler import checks
+from jaxrock.compiler.hints import jit_low_effort
 from jaxrock.engines.scene import peak_bound
 from jaxrock.engines.stepper import AbstractEngine
 from jaxrock.engines.taylor.careful import Series
@@ -125,7 +125,7 @@ class FittedScene(eqx.Module):
         """Return the rotation at times up to `until`, and whether the engine computed the response."""
         values = dict(zip(self.names, self.values(point)))
         duration = until + (self._reach if "delay" in self.names else 0.0)
-        with put_down() as checks:
+        with checks.collect() as collected:
             block, motion, initial = self.at(values)
             response = simulate(
                 block, motion, self.model, initial=initial, duration=duration, engine=self.engine, samples=2
@@ -133,7 +133,7 @@ class FittedScene(eqx.Module):
             rotation, _ = response(jnp.clip(time - values.get("delay", 0.0), 0.0, duration))
         # A verdict that is too close to call concerns the time after the data.
         known = (response.status == Status.successful) | (response.status == Status.undecided)
-        for _, failed in checks:
+        for _, failed in collected:
             known &= ~failed
         return rotation + values.get("offset", 0.0), known
 
@@ -155,8 +155,8 @@ def _given(block: Block | AsymmetricBlock, names: Sequence[str]) -> Block | Asym
     return AsymmetricBlock(block.alpha1, block.alpha2, block.p1, block.inertia_ratio, radii, law)
 
 
-@quickly(follows_scenes=True)
-def history(point, time, until, scene: FittedScene):
+@jit_low_effort(follows_scenes=True)
+def rotation_history(point, time, until, scene: FittedScene):
     """Return the rotations at one point, their derivatives by the coordinates, and whether all are known and finite."""
 
     def value_twice(point):

@@ -27,27 +27,27 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.scipy.special import ndtr
-from jaxtyping import Array, ArrayLike, Bool, Inexact
+from jaxtyping import Array, ArrayLike, Bool
 
-from jaxrock._arguments import arguments
-from jaxrock._checks import as_real, below_one, check_shapes, placed, positive, put_down, scalar, shown
-from jaxrock._quickly import quickly
-from jaxrock._settings import called_by_users
+from jaxrock._arguments.annotations import arguments
+from jaxrock._arguments.ranges import below_one, positive, scalar
+from jaxrock._core.arrays import as_real, check_shapes, shown, to_device
+from jaxrock._core.settings import called_by_users
+from jaxrock._core.types import Real
+from jaxrock.compiler import checks, trace_function
+from jaxrock.compiler.hints import jit_low_effort
 from jaxrock.engines.stepper import AbstractEngine
-from jaxrock.inverse.observations import ROTATION, TOPPLED, Observations
+from jaxrock.inverse.observations import SEEN_ROTATION, SEEN_TOPPLED, Flags, Observations
 from jaxrock.inverse.scatter import LEAST_ACCURATE, MOST_ACCURATE, Possible, Quadrature, are_known_well, levels_around
 from jaxrock.models.equation import AbstractEquation
 from jaxrock.models.rigid import Housner
+from jaxrock.motions.mirrored import scaled_and_mirrored
 from jaxrock.motions.motion import AbstractMotion
 from jaxrock.motions.pulses.pulse import AbstractPulse
-from jaxrock.motions.turned import felt
 from jaxrock.responses.current_model import current_model
 from jaxrock.responses.outcome import outcome
 from jaxrock.status import Status
-from jaxrock.transforms.user_function import ByIdentity, UserFunction, current_function
 
-Real = Inexact[Array, "..."]
-Flags = Bool[Array, "..."]
 _Found = tuple[Real, Flags, Flags]  # margin and rotation, overturned, known
 _NO_STRENGTH = 1e-30  # [g]
 _DRAWS = 8  # random quadratures from which the error of the quadrature is estimated
@@ -109,7 +109,7 @@ class Likelihood(eqx.Module):
         if isinstance(motion, AbstractMotion):
             raise ValueError(f"Argument `motion` must make a motion of its parameters, but is one: {motion}.")
         self.observations, self.model, self.engine = observations, model, engine
-        self.motion = motion if isinstance(motion, eqx.Module) else ByIdentity(motion)
+        self.motion = motion if isinstance(motion, eqx.Module) else trace_function(motion)
         self.scatter = scalar("scatter", positive("scatter", scatter))
         self.lapse = scalar("lapse", below_one("lapse", lapse))
         exact = are_known_well(observations, self.scatter, accuracy)
@@ -127,7 +127,7 @@ class Likelihood(eqx.Module):
         """
         _check_names(self.motion, names)
         seen, number = self.observations, jax.ShapeDtypeStruct((), jnp.result_type(float))
-        parts = current_function(self.motion, **dict.fromkeys(names, number)), current_model(self.model, seen.blocks)
+        parts = trace_function(self.motion, **dict.fromkeys(names, number)), current_model(self.model, seen.blocks)
         return eqx.tree_at(lambda it: (it.motion, it.model), self, parts)
 
     @called_by_users
@@ -158,13 +158,14 @@ class Likelihood(eqx.Module):
         # The rotation in a scene that was not computed is unknown: use the flat density.
         density = jnp.where(possible.known, density, _FLAT)
         ends = jnp.full_like(density[:1], _FLAT)
-        return possible.log_probabilities(jnp.where(seen.seen == ROTATION, jnp.concatenate([ends, density, ends]), 0.0))
+        density = jnp.concatenate([ends, density, ends])
+        return possible.log_probabilities(jnp.where(seen.seen == SEEN_ROTATION, density, 0.0))
 
     def _terms(self, logarithms: Real, impossible: Flags) -> Real:
         seen = self.observations
         _, topples, measured = logarithms
-        terms = jnp.where(seen.seen == TOPPLED, topples, measured)
-        terms = self._or_lapse(terms, jnp.where(seen.seen == ROTATION, _FLAT, 0.0))
+        terms = jnp.where(seen.seen == SEEN_TOPPLED, topples, measured)
+        terms = self._or_lapse(terms, jnp.where(seen.seen == SEEN_ROTATION, _FLAT, 0.0))
         return jnp.where(impossible[..., None], -jnp.inf, terms)
 
     def _or_lapse(self, log_probability: Real, flat: Real | float = 0.0) -> Real:
@@ -182,7 +183,7 @@ class Likelihood(eqx.Module):
 
         Eight quadratures with as many nodes at random places give it (Cranley & Patterson 1976)."""
         found = [np.asarray(each.survival(values)) for each in self.drawn()]
-        return placed(np.std(found, axis=0, ddof=1))
+        return to_device(np.std(found, axis=0, ddof=1))
 
     @called_by_users
     def drawn(self) -> list["Likelihood"]:
@@ -221,7 +222,7 @@ class Likelihood(eqx.Module):
         seen = self.observations
         stands, topples = jnp.maximum(self._or_lapse(logarithms[:2]), -1e3)
         share, lost = jnp.exp(stands), jnp.exp(topples)
-        badness = jnp.where(seen.seen == TOPPLED, -topples, -stands)
+        badness = jnp.where(seen.seen == SEEN_TOPPLED, -topples, -stands)
         mean, variance = -(share * stands + lost * topples), share * lost * (stands - topples) ** 2
 
         # The expected rotation of a rock that stands.
@@ -231,7 +232,7 @@ class Likelihood(eqx.Module):
         centre = jnp.sum(weight * possible.rotation, axis=(0, -2)) / total
         spread = possible.rotation_width**2 + (possible.rotation - centre[..., None, :]) ** 2
         spread = seen.rotation_sd**2 + jnp.sum(weight * spread, axis=(0, -2)) / total
-        measured = jnp.where((seen.seen == ROTATION) & (total > 1e-6), 0.5, 0.0)
+        measured = jnp.where((seen.seen == SEEN_ROTATION) & (total > 1e-6), 0.5, 0.0)
         return badness + measured * (seen.rotation - centre) ** 2 / spread, mean + measured, variance + measured
 
     def _possible(
@@ -278,9 +279,9 @@ class Likelihood(eqx.Module):
 
     def _strength(self, names: tuple[str, ...], parameters: Real) -> tuple[Real, Bool[Array, ""]]:
         """Return the logarithm of the strength of a motion, and whether the motion is impossible."""
-        with put_down() as checks:
+        with checks.collect() as collected:
             strength = _log_strength(_made(self.motion(**dict(zip(names, parameters)))))
-        failed = jnp.stack([~jnp.isfinite(strength), *(bad for _, bad in checks)]).any()
+        failed = jnp.stack([~jnp.isfinite(strength), *(bad for _, bad in collected)]).any()
         return jnp.where(failed, 0.0, strength), failed
 
 
@@ -288,10 +289,8 @@ def _check_names(motion: Callable, names: Sequence[str]) -> None:
     """Raise ValueError where the function of the motion does not take parameters of such names."""
     if not names:
         raise ValueError("Argument `values` must name the parameters of the motion, but is empty.")
-    if isinstance(motion, UserFunction):
-        return  # tracing has already checked its names
     try:
-        signature = inspect.signature(motion.function if isinstance(motion, ByIdentity) else motion)
+        signature = inspect.signature(motion)
     except ValueError:  # some functions that are not written in Python have no signature
         return
     try:
@@ -309,7 +308,7 @@ def _made(motion: Any) -> AbstractMotion:
     return motion
 
 
-@quickly(eqx.filter_jit, follows_scenes=True)
+@jit_low_effort(eqx.filter_jit, follows_scenes=True)
 def as_program(what: Callable, likelihood: Likelihood, values: Mapping[str, ArrayLike], *how):
     """Run a function of a `current` likelihood, at values by name, as one compiled program."""
     return what(likelihood, values, *how)
@@ -327,7 +326,7 @@ def _of_strength(motion: AbstractMotion, logarithm: Real, way: Real) -> Abstract
     """
     if isinstance(motion, AbstractPulse):
         motion = eqx.tree_at(lambda pulse: pulse.amplitude, motion, jnp.sign(motion.amplitude))
-    return felt(motion, way * jnp.exp(logarithm - _log_strength(motion)))
+    return scaled_and_mirrored(motion, way * jnp.exp(logarithm - _log_strength(motion)))
 
 
 class _Scene(eqx.Module):
@@ -340,7 +339,7 @@ class _Scene(eqx.Module):
 
     def results(self, parameters: Real, level: Real, way: Real, block) -> tuple[Real, _Found]:
         """Return margin and rotation; as auxiliary data these again, the verdict, and whether it is known."""
-        with put_down():  # `_strength` collects the motion's checks, and the rocks have passed theirs
+        with checks.collect():  # `_strength` collects the motion's checks, and the rocks have passed theirs
             motion = self.motion(**dict(zip(self.names, parameters)))
             result = outcome(block, _of_strength(motion, level, way), self.model, engine=self.engine)
         rotation = jnp.where(result.overturned, 0.0, result.max_rotation)

@@ -25,10 +25,10 @@ from typing import Any
 
 import numpy as np
 
-from jaxrock._arguments import path_of
-from jaxrock._checks import Range, size
-from jaxrock._text import check_end, file_error, text_lines
-from jaxrock._words import meant
+from jaxrock._arguments.annotations import path_of
+from jaxrock._arguments.ranges import Range, size
+from jaxrock._core.did_you_mean import did_you_mean
+from jaxrock._core.text import check_end, file_error, text_lines
 from jaxrock.blocks.asymmetric import AsymmetricBlock
 from jaxrock.blocks.restitution import ratio_of_inertia
 from jaxrock.blocks.rigid import GRAVITY
@@ -197,7 +197,7 @@ def _rock(fields: dict[str, str]) -> dict:
     _check_degrees(values)
     if called(fields["observed"]) is None:
         said = fields["observed"]
-        raise ValueError(f"`observed` must be one of {', '.join(SEEN)}, but is {said!r}.{meant(said, CALLED)}")
+        raise ValueError(f"`observed` must be one of {', '.join(SEEN)}, but is {said!r}.{did_you_mean(said, CALLED)}")
     rock: dict[str, Any] = {"name": fields.get("name", ""), "observed": called(fields["observed"])}
     if "width_m" in fields:
         rock |= _rectangle(*(_given(name, get(name, None)) for name in ("width_m", "height_m")))

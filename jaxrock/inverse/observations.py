@@ -9,27 +9,19 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Inexact, Int
 
-from jaxrock._arguments import arguments, list_of
-from jaxrock._checks import (
-    Values,
-    as_real,
-    checked,
-    if_traced,
-    is_traced,
-    not_negative,
-    of_each,
-    one_program,
-    placed,
-    put_down,
-    shown,
-)
-from jaxrock._described import described
-from jaxrock._label import Label
-from jaxrock._settings import called_by_users
-from jaxrock._words import meant
+from jaxrock._arguments.annotations import arguments, list_of
+from jaxrock._arguments.ranges import checked, not_negative
+from jaxrock._arguments.repr import described
+from jaxrock._core.arrays import Values, as_real, if_traced, is_traced, of_each, shown, to_device
+from jaxrock._core.did_you_mean import did_you_mean
+from jaxrock._core.label import Label
+from jaxrock._core.one_program import one_program
+from jaxrock._core.settings import called_by_users
+from jaxrock._core.types import Real
 from jaxrock.blocks.asymmetric import AsymmetricBlock
 from jaxrock.blocks.restitution import AngularMomentum, Corners, Housner
 from jaxrock.blocks.rigid import Block
+from jaxrock.compiler import checks
 
 SEEN = ("survived", "toppled", "rotation")
 _ALSO = {  # synonyms that are accepted
@@ -38,9 +30,9 @@ _ALSO = {  # synonyms that are accepted
     "rotation": ("rocked", "measured"),
 }
 CALLED = {word: name for name in SEEN for word in (name, *_ALSO[name])}
-TOPPLED, ROTATION = 1, 2  # places in SEEN
+SEEN_TOPPLED, SEEN_ROTATION = 1, 2  # places in SEEN
 Rocks = Inexact[Array, " rocks"]
-Real = Inexact[Array, "..."]
+Flags = Bool[Array, "..."]
 
 
 class OtherSide(eqx.Module):
@@ -135,7 +127,7 @@ class Observations(eqx.Module):
         )
         _check_below("alpha_sd", self.alpha_sd, self.alpha, "`alpha`, and in radians")
         _check_below("p_sd", self.p_sd, self.p, "`p`, and in rad/s")
-        measured = np.asarray(self.seen) == ROTATION
+        measured = np.asarray(self.seen) == SEEN_ROTATION
         self.rotation, self.rotation_sd = (
             _measured(name, value, measured) for name, value in (("rotation", rotation), ("rotation_sd", rotation_sd))
         )
@@ -203,7 +195,7 @@ class Observations(eqx.Module):
     @property
     def ways(self) -> Inexact[Array, "ways rocks"]:
         """Signs of the motion that each rock may have felt, all equally likely."""
-        return placed(np.ones((1, self.alpha.size))) if self.other is None else self.other.ways
+        return to_device(np.ones((1, self.alpha.size))) if self.other is None else self.other.ways
 
     @property
     def weaker_alpha(self) -> Rocks:
@@ -224,7 +216,7 @@ class Observations(eqx.Module):
     @called_by_users
     def blocks_at(self, alpha: ArrayLike, p: ArrayLike, restitution: ArrayLike | None) -> Block | AsymmetricBlock:
         """Return the rocks with other values on side 1, (..., rocks), unchecked, as one block of arrays."""
-        with put_down():
+        with checks.collect():
             return Block(alpha, p, restitution) if self.other is None else _two_sided(self.other, alpha, p, restitution)
 
     @property
@@ -257,7 +249,7 @@ def _by_momentum(other: OtherSide | None, alpha: Real, p: Rocks) -> Real:
     """Return the restitution by angular momentum. Without `jit`, JAX would dispatch each operation separately."""
     if other is None:
         return Housner().ratio(Corners(alpha, alpha, p), jnp.zeros_like(alpha))
-    with put_down():
+    with checks.collect():
         block = _two_sided(other, alpha, p, None)
     return jnp.sqrt(block.restitution1 * block.restitution2)
 
@@ -270,7 +262,7 @@ def _where(which: ArrayLike, this: ArrayLike, that: ArrayLike) -> Array:
     """Return `jnp.where`; concrete values use NumPy, which compiles nothing."""
     if is_traced((which, this, that)):
         return jnp.where(which, this, that)
-    return placed(np.where(which, this, that))
+    return to_device(np.where(which, this, that))
 
 
 def _chosen(which: ArrayLike, count: int) -> np.ndarray:
@@ -303,7 +295,7 @@ def _list(name: str, value: Values, count: int) -> Rocks:
         raise ValueError(f"Argument `{name}` must have a value for {each}, but has shape {array.shape}.")
     if array.ndim:
         return array
-    return jnp.full(count, array) if is_traced(array) else placed(np.full(count, array))
+    return jnp.full(count, array) if is_traced(array) else to_device(np.full(count, array))
 
 
 def _words(seen: Sequence[str], count: int) -> Int[Array, " rocks"]:
@@ -311,10 +303,10 @@ def _words(seen: Sequence[str], count: int) -> Int[Array, " rocks"]:
         raise ValueError(f"Argument `seen` must have a word for each of {count} rocks, but is {seen!r}.")
     for word in seen:
         if called(word) is None:
-            told = f"must hold only {', '.join(map(repr, SEEN))}, but holds {word!r}.{meant(word, CALLED)}"
+            told = f"must hold only {', '.join(map(repr, SEEN))}, but holds {word!r}.{did_you_mean(word, CALLED)}"
             raise ValueError(f"Argument `seen` {told}")
     with jax.ensure_compile_time_eval():  # the result stays concrete within `jax.jit`
-        return placed(np.array([SEEN.index(called(word)) for word in seen]))
+        return to_device(np.array([SEEN.index(called(word)) for word in seen]))
 
 
 def called(word: str) -> str | None:

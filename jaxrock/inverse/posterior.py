@@ -13,12 +13,13 @@ from typing import Annotated, Any, NamedTuple
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Bool, Inexact
+from jaxtyping import Array, ArrayLike, Bool
 
-from jaxrock._arguments import arguments, at_least
-from jaxrock._checks import inner_share, scalar
-from jaxrock._progress import Progress
-from jaxrock._tables import AbstractTable, Column
+from jaxrock._arguments.annotations import arguments, at_least
+from jaxrock._arguments.ranges import inner_share, scalar
+from jaxrock._arguments.tables import AbstractTable, Column
+from jaxrock._core.progress import Progress
+from jaxrock._core.types import Real
 from jaxrock.engines.stepper import AbstractEngine
 from jaxrock.inverse.densities import LogDensity
 from jaxrock.inverse.estimate import Estimate, EstimateStatus, estimate_motion
@@ -29,10 +30,9 @@ from jaxrock.inverse.unknowns import Problem, Unknown, densities
 from jaxrock.models.equation import AbstractEquation
 from jaxrock.models.rigid import Housner
 from jaxrock.motions.pulses import UNITS
-from jaxrock.numerics.proposals import ROUNDS, independent_proposals
+from jaxrock.numerics.independence_sampler import ROUNDS, independent_proposals
 from jaxrock.status import Enumeration, item
 
-Real = Inexact[Array, "..."]
 _CHAINS = 8
 _ROUND = 512  # points of a round, of all chains together
 _PATIENCE, _POOR = 512, 0.03  # steps before a restart; effective samples for each step below which chains restart
@@ -154,7 +154,7 @@ def sample_motion(
     - `sampler`: a function that makes another sampler from a `LogDensity`, such as
       `lambda density: numpyro.infer.NUTS(potential_fn=lambda point: -density(point))` or
       `lambda density: blackjax.nuts(density, 0.5, jnp.ones(2))`. Its eight chains begin at maxima of the estimate; the
-      first 500 steps of each are not kept. None: chains of the package (`jaxrock.numerics.proposals`).
+      first 500 steps of each are not kept. None: chains of the package (`jaxrock.numerics.independence_sampler`).
     - `progress`: whether to draw a progress bar; None: on a terminal, if it takes long.
 
     **Returns:** a `Posterior`.

@@ -4,9 +4,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxrock.inverse.scan import evenly
+from jaxrock.inverse.scan import low_discrepancy
 from jaxrock.inverse.unknowns import Evaluator
-from jaxrock.numerics.climb import Summits, climb
+from jaxrock.numerics.batched_bfgs import Summits, batched_bfgs
 
 _RATIO = 1.9207  # log-likelihood ratio of 95 %, half of 1.96^2
 _ROOT = np.sqrt(2 * _RATIO)
@@ -184,7 +184,7 @@ class _Sides:
         inner = np.clip(np.array(begin), low + _AWAY * (high - low), high - _AWAY * (high - low))
         points = self.evaluate.points(np.where(free, inner, begin))
         group = np.repeat(np.arange(len(wanted)), _SEEDS)
-        reached = climb(self.evaluate, points, np.array(free), rounds=25, promise=1e-3, group=group)
+        reached = batched_bfgs(self.evaluate, points, np.array(free), rounds=25, promise=1e-3, group=group)
         places, values = self.evaluate.places(reached.points), reached.values
         for number, (side, value) in enumerate(wanted.items()):
             best = _SEEDS * number + int(np.argmax(values[_SEEDS * number : _SEEDS * (number + 1)]))
@@ -202,7 +202,7 @@ class _Sides:
         for (j, s), value in wanted.items():
             nearest = min(self.rows[j, s], key=lambda row: abs(row.value - value))
             nearby = self._nearby(j, value, abs(nearest.value - value), nearest.place)
-            others = low + (high - low) * evenly(_SCANNED, low.size)
+            others = low + (high - low) * low_discrepancy(_SCANNED, low.size)
             beside = np.clip(nearest.place + _BESIDE * (others - (low + high) / 2), low, high)
             tried.append(np.concatenate([[nearest.place, nearby], others, beside]))
             tried[-1][:, j] = value

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxrock._checks import shown
+from jaxrock._core.arrays import shown
 from jaxrock.inverse.densities import LogDensity
 
 _ROUND = 250  # steps between two checks of the diagnostics

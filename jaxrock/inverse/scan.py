@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jaxrock.inverse.unknowns import Evaluator
-from jaxrock.numerics.climb import Summits
+from jaxrock.numerics.batched_bfgs import Summits
 
 Places = Float[np.ndarray, "n parameters"]
 _CENTRES, _AROUND = 16, 16  # best places of a scan, and places of the next one around each
@@ -66,10 +66,10 @@ def spread(count: int, evaluate: Evaluator) -> Places:
     Started from Halton's sequence (of SciPy), five of eight fits end on a lower summit, and one on a higher.
     """
     low, high = evaluate.ends
-    return low + (high - low) * (0.01 + 0.98 * evenly(count, low.size))
+    return low + (high - low) * (0.01 + 0.98 * low_discrepancy(count, low.size))
 
 
-def evenly(count: int, dimensions: int) -> Places:
+def low_discrepancy(count: int, dimensions: int) -> Places:
     """Return multiples of irrational numbers, modulo one, in a box of size 1."""
     root = np.roots([1, *[0] * (dimensions - 1), -1, -1])
     ratio = np.max(root.real[np.abs(root.imag) < 1e-9])  # x^(n+1) = x + 1, the golden ratio for n = 1

@@ -29,13 +29,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.scipy.special import log_ndtr, logsumexp, ndtr
-from jaxtyping import Array, ArrayLike, Bool, Inexact
+from jaxtyping import ArrayLike
 
-from jaxrock._checks import is_traced, placed
-from jaxrock.inverse.observations import Observations
+from jaxrock._core.arrays import is_traced, to_device
+from jaxrock._core.types import Real
+from jaxrock.inverse.observations import Flags, Observations
 
-Real = Inexact[Array, "..."]
-Flags = Bool[Array, "..."]
 MOST_ACCURATE, LEAST_ACCURATE = 1e-3, 0.05  # range of errors of a probability
 _APART, _APART_EXACT = 25.0, 10.0  # distance of nodes, in standard deviations for each unit of the error
 _LEAST_APART, _MOST_APART = 0.01, 0.8
@@ -79,7 +78,7 @@ class Quadrature(eqx.Module):
         normals = _latin_hypercube(rocks)
         absorbed = float(1 - np.mean(normals[0] ** 2))
         phases = (np.arange(rocks) * _GOLDEN) % 1
-        return cls(apart, int(np.ceil(_REACH / apart)), absorbed, *placed((phases, normals)))
+        return cls(apart, int(np.ceil(_REACH / apart)), absorbed, *to_device((phases, normals)))
 
     @classmethod
     def coarse(cls) -> "Quadrature":
@@ -99,7 +98,7 @@ class Quadrature(eqx.Module):
         if count > 1:
             share = np.stack([(rng.permutation(count) if i else np.arange(count)) for i in range(3)])
             normals = _quantile((share + rng.uniform(0.25, 0.75, share.shape)) / count)
-        return eqx.tree_at(lambda it: (it.phases, it.normals), self, placed((phases, normals)))
+        return eqx.tree_at(lambda it: (it.phases, it.normals), self, to_device((phases, normals)))
 
 
 @functools.cache

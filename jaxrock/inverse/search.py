@@ -10,14 +10,14 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Inexact
+from jaxtyping import Array, Float
 
-from jaxrock._checks import placed, shown
-from jaxrock._quickly import quickly
+from jaxrock._core.arrays import shown, to_device
+from jaxrock._core.types import Real
+from jaxrock.compiler.hints import jit_low_effort
 from jaxrock.inverse.unknowns import Evaluator, Problem
-from jaxrock.numerics.climb import Summits, climb
+from jaxrock.numerics.batched_bfgs import Summits, batched_bfgs
 
-Real = Inexact[Array, "..."]
 _TOGETHER = 8  # climbers in one call of the compiled program
 _STEPS = 300  # largest number of steps of an optimiser
 _TOLERANCE = 1e-6  # relative and absolute tolerance at which an optimiser of optax has converged
@@ -40,7 +40,7 @@ class Trace(eqx.Module):
         assert summits.path is not None
         points, values = summits.path
         parameters = evaluate.problem.parameters(evaluate.places(points))
-        return cls(*placed((np.where(np.isnan(values)[..., None], np.nan, parameters), values)))
+        return cls(*to_device((np.where(np.isnan(values)[..., None], np.nan, parameters), values)))
 
 
 def optimizer_or_none(name: str, value: Any) -> Any:
@@ -61,7 +61,7 @@ def _is_of_optax(value: Any) -> bool:
 
 def summits_of(evaluate: Evaluator, starts: np.ndarray, optimizer: Any = None) -> Summits:
     """Find maxima from many starts by an optimiser; None: the package's batched BFGS."""
-    return climb(evaluate, starts) if optimizer is None else _Foreign.of(optimizer, evaluate).climbed(starts)
+    return batched_bfgs(evaluate, starts) if optimizer is None else _Foreign.of(optimizer, evaluate).climbed(starts)
 
 
 class _Foreign:
@@ -138,7 +138,7 @@ def _each(function):
     return eqx.filter_vmap(function, in_axes=eqx.if_array(0), out_axes=eqx.if_array(0))
 
 
-@quickly(eqx.filter_jit, follows_scenes=True)
+@jit_low_effort(eqx.filter_jit, follows_scenes=True)
 def _begun(solver, problem: Problem, ends: Real, points: Real):
     loss = _loss_of(problem, ends)
 
@@ -149,7 +149,7 @@ def _begun(solver, problem: Problem, ends: Real, points: Real):
     return _each(one)(points)
 
 
-@quickly(eqx.filter_jit, follows_scenes=True)
+@jit_low_effort(eqx.filter_jit, follows_scenes=True)
 def _stepped(solver, problem: Problem, ends: Real, points: Real, state):
     loss = _loss_of(problem, ends)
 

@@ -7,18 +7,19 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Bool, Float, Inexact
+from jaxtyping import Array, ArrayLike, Float
 
-from jaxrock._arguments import arguments, pair
-from jaxrock._checks import finite, positive, scalar, shown
-from jaxrock._described import described
-from jaxrock._quickly import quickly
+from jaxrock._arguments.annotations import arguments, pair
+from jaxrock._arguments.ranges import finite, positive, scalar
+from jaxrock._arguments.repr import described
+from jaxrock._core.arrays import shown
+from jaxrock._core.types import Real
+from jaxrock.compiler.hints import jit_low_effort
 from jaxrock.inverse.batches import in_batches
 from jaxrock.inverse.likelihood import Likelihood
+from jaxrock.inverse.observations import Flags
 from jaxrock.inverse.scatter import Quadrature
 
-Real = Inexact[Array, "..."]
-Flags = Bool[Array, "..."]
 _LANES = 4  # points in one call of the compiled program with slopes
 _SCANNED = 64  # points in one call of the program without slopes
 _FARTHEST = 5.0  # largest distance of a prior from its range, in standard deviations; more suggests a mistake
@@ -152,7 +153,7 @@ class Problem(eqx.Module):
         return jnp.sum(terms, axis=-1) + self.log_prior(places)
 
 
-@quickly(eqx.filter_jit, follows_scenes=True)
+@jit_low_effort(eqx.filter_jit, follows_scenes=True)
 def _batch(problem: Problem, places: Real, wanted: Flags) -> tuple[Real, Real, tuple[Real, Real, Real, Real, Real]]:
     def density(places):
         terms, facts = problem.likelihood.terms_and_facts(problem.values(places), wanted)
@@ -163,7 +164,7 @@ def _batch(problem: Problem, places: Real, wanted: Flags) -> tuple[Real, Real, t
     return value, back(jnp.ones_like(value))[0], facts
 
 
-@quickly(eqx.filter_jit, follows_scenes=True)
+@jit_low_effort(eqx.filter_jit, follows_scenes=True)
 def _log_density(problem: Problem, places: Real, wanted: Flags) -> Real:
     return problem.log_density(places, slopes=False, wanted=wanted)
 

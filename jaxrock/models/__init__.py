@@ -3,7 +3,7 @@
 Imports `blocks` and `numerics`. Start with `equation`, the interface of every model, then `rigid`.
 """
 
-from jaxrock._surface import shown as _shown
+from jaxrock._core.namespace import shown as _shown
 from jaxrock.models.coefficients import (
     Coefficients as Coefficients,
     Terms as Terms,

@@ -18,15 +18,13 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Inexact
 
+from jaxrock._core.types import Scalar
+from jaxrock.compiler.hints import select
 from jaxrock.models import free_swing
 from jaxrock.models.equation import AbstractMoments, Angle
-from jaxrock.numerics.choice import where
 from jaxrock.numerics.elementary import sine_cosine
 from jaxrock.numerics.polynomial import sum_of_products
-
-Scalar = Inexact[Array, ""]
 
 _ONE = 1.0
 
@@ -283,7 +281,7 @@ class Coefficients(AbstractMoments):
         lasts = here * flat > 0
         if arm.constant is not None and arm.cosine is not None:  # concave, so its tangent is above it
             lasts = lasts & (arm.constant >= 0) & (arm.cosine >= 0)
-        return where(lasts, self._enough(angle, hold, push * jnp.sign(here), weight), jnp.inf)
+        return select(lasts, self._enough(angle, hold, push * jnp.sign(here), weight), jnp.inf)
 
     def _enough(self, angle: Angle, hold: Scalar, push: Scalar, weight: Scalar | None) -> Scalar:
         """Compute `held_manifold` for an arm that keeps its sign, which `push` includes."""
@@ -308,7 +306,7 @@ class Coefficients(AbstractMoments):
         light = jnp.zeros_like(slope, bool) if weight is None else weight <= 0
         if self._may_right_again:  # also where its moment no longer falls at pi/2: it rights itself again
             light = light | (jnp.asarray(moment.cosine) <= 0)
-        return where(light, jnp.inf, hold / jnp.sqrt(where(light, 1.0, slope)))
+        return select(light, jnp.inf, hold / jnp.sqrt(select(light, 1.0, slope)))
 
     def unheld_manifold(self, angle: Angle, hold: Scalar, push: Scalar, weight: Scalar | None = None) -> Scalar | float:
         """Return zero where no moment further on can hold the block.
@@ -322,4 +320,4 @@ class Coefficients(AbstractMoments):
         most = push * (most + _length(_or_zero(arm.sine), arm.cosine))
         # The restoring moment falls, or rises again: it is largest at an end. Beyond pi/2 no moment counts as holding.
         may = (flat > 0) | (_weighed(weight, jnp.maximum(self.restoring(angle), flat)) + most > 0)
-        return where(may & (angle.value < jnp.pi / 2), jnp.inf, 0.0)
+        return select(may & (angle.value < jnp.pi / 2), jnp.inf, 0.0)

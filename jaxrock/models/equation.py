@@ -13,15 +13,15 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Inexact
 
-from jaxrock._parameters import Owner, check_declared
+from jaxrock._arguments.parameters import Owner, check_declared
+from jaxrock._core.types import Scalar
 from jaxrock.blocks.asymmetric import AsymmetricBlock
 from jaxrock.blocks.rigid import Block, Side
-from jaxrock.numerics.choice import where
+from jaxrock.compiler.hints import select
 from jaxrock.numerics.elementary import sine_cosine
 from jaxrock.numerics.gauss_legendre import gauss_legendre_of_unit
 from jaxrock.numerics.roots import carried
 
-Scalar = Inexact[Array, ""]
 _GAUSS = gauss_legendre_of_unit(12)
 
 
@@ -206,7 +206,7 @@ def last_rise(moments: AbstractMoments, like: Scalar) -> Scalar:
         return moments.restoring(at) / jnp.abs(moments.arm(at))
 
     found = jax.vmap(strength)(grid)
-    return jax.lax.stop_gradient(jnp.max(where(found[1:] > found[:-1], grid[1:], 0.0)))
+    return jax.lax.stop_gradient(jnp.max(select(found[1:] > found[:-1], grid[1:], 0.0)))
 
 
 def _grid(like: Scalar) -> Inexact[Array, " angles"]:
@@ -226,13 +226,13 @@ def first_zero(moment: Callable, like: Scalar) -> Scalar:
         low, high = bracket
         middle = (low + high) / 2
         above = jax.lax.stop_gradient(moment(middle)) > 0
-        return where(above, middle, low), where(above, high, middle)
+        return select(above, middle, low), select(above, high, middle)
 
     low, _ = jax.lax.fori_loop(0, 60, halve, (grid[jnp.maximum(first - 1, 0)], grid[first]))
     found = jnp.any(falls)
 
     def left(x):
         value, slope = jax.value_and_grad(moment)(x)
-        return value / where(found, slope, 1.0)
+        return value / select(found, slope, 1.0)
 
-    return where(found, carried(jax.lax.stop_gradient(low), left), jnp.pi / 2)
+    return select(found, carried(jax.lax.stop_gradient(low), left), jnp.pi / 2)

@@ -13,11 +13,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Inexact
 
+from jaxrock._core.types import Scalar
 from jaxrock.numerics.elementary import exponential, sine_cosine, sine_lag, sine_ratio
 from jaxrock.numerics.gauss_legendre import gauss_legendre_of_unit
 from jaxrock.numerics.roots import bracketed_root
-
-Scalar = Inexact[Array, ""]
 
 # With 24 nodes the error stays below rounding of the energy. It is 1e-15 up to lengths of 10 (a turn 1e-4 from the
 # balance), and 1e-11 at 35, where rounding decides whether the block turns.

@@ -4,20 +4,19 @@ from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Bool, Inexact
+from jaxtyping import Array, ArrayLike, Bool
 
-from jaxrock._arguments import arguments
-from jaxrock._checks import one_program
-from jaxrock._described import described
-from jaxrock._parameters import parameter, set_parameters
+from jaxrock._arguments.annotations import arguments
+from jaxrock._arguments.parameters import parameter, set_parameters
+from jaxrock._arguments.repr import described
+from jaxrock._core.one_program import one_program
+from jaxrock._core.types import Scalar
 from jaxrock.blocks.asymmetric import AsymmetricBlock
 from jaxrock.blocks.edge import Edge, EdgePieces
 from jaxrock.blocks.restitution import ratio_of_inertia
 from jaxrock.blocks.rigid import Block, Side
 from jaxrock.models.equation import AbstractEquation, AbstractMoments, Angle, Rolled, first_zero, last_rise
 from jaxrock.numerics.elementary import sine_cosine
-
-Scalar = Inexact[Array, ""]
 
 
 class Rolling(AbstractEquation):

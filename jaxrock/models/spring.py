@@ -4,7 +4,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Inexact
 
-from jaxrock._checks import checked, one_of, whole
+from jaxrock._arguments.ranges import checked, one_of, whole
 from jaxrock.blocks.rigid import Block, Side
 from jaxrock.models.coefficients import Coefficients, Terms
 from jaxrock.models.equation import AbstractEquation

@@ -9,14 +9,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Inexact
 
-from jaxrock._arguments import arguments
-from jaxrock._checks import Values, checked, positive
-from jaxrock._parameters import parameter, set_parameters
+from jaxrock._arguments.annotations import arguments
+from jaxrock._arguments.parameters import parameter, set_parameters
+from jaxrock._arguments.ranges import checked, positive
+from jaxrock._core.arrays import Values
+from jaxrock._core.types import Scalar
 from jaxrock.blocks.restitution import Constant
 from jaxrock.blocks.rigid import Block, Side
-from jaxrock.models.equation import AbstractEquation, AbstractMoments, Angle, Scalar, first_zero, last_rise
-from jaxrock.numerics.choice import where
-from jaxrock.numerics.lookup import pick, stretch_from
+from jaxrock.compiler.hints import select
+from jaxrock.models.equation import AbstractEquation, AbstractMoments, Angle, first_zero, last_rise
+from jaxrock.numerics.lookup import stretch_from, take
 
 _CREEP = 1e-30  # a velocity so small that only a jump at zero velocity shows
 
@@ -105,11 +107,11 @@ class Equation(AbstractEquation):
             at_none, at_one, at_two = (moment(push=push, opening=opening) for push in (0.0, 1.0, 2.0))
             bends.append(jnp.abs(at_two - 2 * at_one + at_none))
         return {
-            "The restoring moment must be positive at rotation 0.": alone <= 0,
-            "The overturning arm must be positive at rotation 0.": arm <= 0,
+            "The restoring moment must be positive at rotation 0": alone <= 0,
+            "The overturning arm must be positive at rotation 0": arm <= 0,
             "The dissipation must not jump where the velocity changes its sign: dry friction is nearly "
-            "k tanh(v/w) with a small w, not k sign(v).": jump > noise,
-            "The acceleration must be linear in the push of the ground.": jnp.maximum(*bends) > noise,
+            "k tanh(v/w) with a small w, not k sign(v)": jump > noise,
+            "The acceleration must be linear in the push of the ground": jnp.maximum(*bends) > noise,
         }
 
     @property
@@ -211,10 +213,10 @@ class FunctionMoments(AbstractMoments):
         starts = jnp.concatenate([jnp.zeros(1, opening.dtype), cast(Array, self.bends_at)])
         number, angle, ends = stretch_from(starts, opening, outward)
         inside = 4 * float(jnp.finfo(opening.dtype).eps)  # at a bend rounding decides the side of the function
-        low, high = pick(starts, number), pick(jnp.append(starts, 4.0), number + 1)
-        stretch = where(number == 0, -1.0, low * (1 + inside)), high * (1 - inside)
+        low, high = take(starts, number), take(jnp.append(starts, 4.0), number + 1)
+        stretch = select(number == 0, -1.0, low * (1 + inside)), high * (1 - inside)
         moments = eqx.tree_at(lambda m: m.stretch, self, stretch, is_leaf=lambda x: x is None)
-        return moments, where(ends, angle, jnp.pi)
+        return moments, select(ends, angle, jnp.pi)
 
     def restoring(self, angle: Angle) -> Scalar:
         """Return the restoring moment over m g R at an opening angle."""
@@ -253,7 +255,7 @@ class FunctionMoments(AbstractMoments):
 
 def _straight_beyond(low: Scalar, high: Scalar, function: Callable, x: Scalar) -> Scalar:
     """Return a function of a number whose tangents continue beyond the interval where it is evaluated."""
-    inside = where(x < low, low, where(x > high, high, x))
+    inside = select(x < low, low, select(x > high, high, x))
     value, slope = jax.jvp(function, (inside,), (jnp.ones_like(inside),))
     return value + slope * (x - inside)
 

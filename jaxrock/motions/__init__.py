@@ -4,7 +4,7 @@ Imports `numerics` and `blocks`. Start with `motion`. A new pulse is a file in `
 `files`.
 """
 
-from jaxrock._surface import shown as _shown
+from jaxrock._core.namespace import shown as _shown
 from jaxrock.motions import intensity as intensity
 from jaxrock.motions.components import (
     Components as Components,

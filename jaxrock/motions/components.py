@@ -11,11 +11,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import ArrayLike
 
-from jaxrock._arguments import arguments, list_of, word_of
-from jaxrock._checks import direction, one_program, scalar, shown
-from jaxrock._described import described
-from jaxrock._precision import frames_of_the_package
-from jaxrock._settings import called_by_users
+from jaxrock._arguments.annotations import arguments, list_of, word_of
+from jaxrock._arguments.ranges import direction, scalar
+from jaxrock._arguments.repr import described
+from jaxrock._core.arrays import shown
+from jaxrock._core.one_program import one_program
+from jaxrock._core.precision import frames_of_the_package
+from jaxrock._core.settings import called_by_users
 from jaxrock.motions.files.parsing import PER_G
 from jaxrock.motions.files.reading import component_columns, read_record
 from jaxrock.motions.files.traces import record_of_trace

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxrock.motions.oscillator import integrals_of_exponential
-from jaxrock.motions.straight import Straight
+from jaxrock.motions.piecewise_linear import PiecewiseLinear
 
 _QUIET = 20.0  # shortest pause that separates two shocks [s]
 _SHOCKS = 64  # largest number of shocks; with more, only longer pauses separate them
@@ -23,7 +23,7 @@ _MANY = 1 << 20  # largest number of samples
 class _Shock(NamedTuple):
     """Straight lines between two pauses, with their begin and length [s]."""
 
-    lines: Straight
+    lines: PiecewiseLinear
     begin: float
     length: float
 
@@ -32,7 +32,7 @@ class _Shock(NamedTuple):
         return self.begin + self.length / 2
 
 
-def squared_amplitudes(lines: Straight, band: tuple[float, float]) -> tuple[float, float]:
+def squared_amplitudes(lines: PiecewiseLinear, band: tuple[float, float]) -> tuple[float, float]:
     """Integrate C^2 and C^2/f over a band of frequencies f [Hz], with C the Fourier amplitude."""
     shocks = _shocks(lines)
     if not shocks:
@@ -54,9 +54,9 @@ def squared_amplitudes(lines: Straight, band: tuple[float, float]) -> tuple[floa
     return float(found[0]), float(found[1])
 
 
-def _shocks(lines: Straight) -> list[_Shock]:
+def _shocks(lines: PiecewiseLinear) -> list[_Shock]:
     """Split lines into shocks, at pauses."""
-    lines = Straight(*(part[lines.length > 0] for part in lines))
+    lines = PiecewiseLinear(*(part[lines.length > 0] for part in lines))
     moving, times = (lines.begin != 0) | (lines.end != 0), lines.times
     places = np.flatnonzero(moving)
     if places.size == 0:
@@ -65,7 +65,7 @@ def _shocks(lines: Straight) -> list[_Shock]:
     quiet = max(_QUIET, np.sort(pauses)[-_SHOCKS] if pauses.size >= _SHOCKS else 0.0)
     groups = np.split(places, np.flatnonzero(pauses > quiet) + 1)
     ends = ((group[0], group[-1] + 1) for group in groups)
-    return [_Shock(Straight(*(x[a:b] for x in lines)), times[a], times[b] - times[a]) for a, b in ends]
+    return [_Shock(PiecewiseLinear(*(x[a:b] for x in lines)), times[a], times[b] - times[a]) for a, b in ends]
 
 
 def _step(shock: _Shock) -> float:

@@ -13,17 +13,19 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Inexact
 
-from jaxrock._arguments import arguments
-from jaxrock._checks import Values, below_one, check_known, checked, inner_share, is_traced, scalar
-from jaxrock._parameters import check_single
-from jaxrock._precision import frames_of_the_package
+from jaxrock._arguments.annotations import arguments
+from jaxrock._arguments.parameters import check_single
+from jaxrock._arguments.ranges import below_one, checked, inner_share, scalar
+from jaxrock._core.arrays import Values, is_traced
+from jaxrock._core.one_program import check_known
+from jaxrock._core.precision import frames_of_the_package
 from jaxrock.blocks.rigid import GRAVITY, Block
 from jaxrock.motions.fourier import squared_amplitudes
 from jaxrock.motions.motion import AbstractMotion
 from jaxrock.motions.oscillator import peaks_of_oscillator
 from jaxrock.motions.peaks import peaks_and_last_velocity
+from jaxrock.motions.piecewise_linear import PiecewiseLinear, piecewise_linear
 from jaxrock.motions.record import Record
-from jaxrock.motions.straight import Straight, straight
 
 __all__ = [
     "arias", "average_spectral_acceleration", "cumulative_absolute_velocity", "mean_period",
@@ -103,7 +105,7 @@ def peak_displacement(motion: AbstractMotion) -> float:
 
     **Raises:** ValueError for a motion of too many cycles within its pieces.
     """
-    lines = straight(motion)
+    lines = piecewise_linear(motion)
     velocity, places = lines.velocity[:-1], lines.displacement
     largest = np.abs(places).max(initial=0.0)
     # Within a line, the velocity v + a t + j t^2/2 passes zero at these times, also from rest.
@@ -145,7 +147,7 @@ def arias(motion: AbstractMotion) -> float:
 
     **Source:** Arias (1970).
     """
-    return float(np.pi / (2 * GRAVITY) * _squares(straight(motion)).sum())
+    return float(np.pi / (2 * GRAVITY) * _squares(piecewise_linear(motion)).sum())
 
 
 @arguments
@@ -156,7 +158,7 @@ def cumulative_absolute_velocity(motion: AbstractMotion) -> float:
 
     **Source:** EPRI (1988).
     """
-    a, b, length = straight(motion)
+    a, b, length = piecewise_linear(motion)
     size = np.abs(a) + np.abs(b)
     crossing = (a * a + b * b) / np.where(size > 0, size, 1.0)
     return float(np.sum(length * np.where(a * b < 0, crossing, size)) / 2)
@@ -178,20 +180,20 @@ def significant_duration(motion: AbstractMotion, begin: ArrayLike = 0.05, end: A
     begin, end = (float(scalar(name, inner_share(name, x))) for name, x in (("begin", begin), ("end", end)))
     if begin >= end:
         raise ValueError(f"Argument `end` must be above `begin`, {begin}, but is {end}.")
-    lines = straight(motion)
+    lines = piecewise_linear(motion)
     sums = np.concatenate([[0.0], np.cumsum(_squares(lines))])
     if not sums[-1] > 0:
         raise ValueError("Argument `motion` must move, but does not.")
     return _time_of(lines, sums, end * sums[-1]) - _time_of(lines, sums, begin * sums[-1])
 
 
-def _squares(lines: Straight) -> np.ndarray:
+def _squares(lines: PiecewiseLinear) -> np.ndarray:
     """Integrate the squared acceleration over each line."""
     a, b, length = lines
     return length * (a * a + a * b + b * b) / 3
 
 
-def _time_of(lines: Straight, sums: np.ndarray, wanted: float) -> float:
+def _time_of(lines: PiecewiseLinear, sums: np.ndarray, wanted: float) -> float:
     """Return the time at which the integral of the squared acceleration reaches a value, by bisection within a line."""
     row = min(max(int(np.searchsorted(sums, wanted)) - 1, 0), lines.length.size - 1)
     a, b, length = (float(part[row]) for part in lines)
@@ -217,7 +219,7 @@ def mean_period(motion: AbstractMotion) -> float:
 
     **Source:** Rathje, Abrahamson & Bray (1998), whose sums over frequencies are these integrals.
     """
-    lines = straight(motion)
+    lines = piecewise_linear(motion)
     if not (lines.length > 0).any():
         raise ValueError("Argument `motion` must last, but ends where it begins.")
     total, weighted = squared_amplitudes(lines, (0.25, 20.0))
@@ -246,7 +248,7 @@ def spectral_acceleration(
     **Source:** Nigam & Jennings (1969).
     """
     period, damping = _oscillators(period, damping)
-    lines = straight(motion)
+    lines = piecewise_linear(motion)
     found = [
         peaks_of_oscillator(lines, float(each), damping)[0] * (2 * np.pi / each) ** 2 / GRAVITY for each in period.flat
     ]
@@ -269,7 +271,7 @@ def spectral_velocity(
     **Raises:** as `spectral_acceleration`.
     """
     period, damping = _oscillators(period, damping)
-    lines = straight(motion)
+    lines = piecewise_linear(motion)
     found = [peaks_of_oscillator(lines, float(each), damping) for each in period.flat]
     found = [peaks[0] * 2 * np.pi / each if pseudo else peaks[1] for peaks, each in zip(found, period.flat)]
     return np.reshape(found, period.shape)

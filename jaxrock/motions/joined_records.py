@@ -12,12 +12,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Inexact, Int
 
-from jaxrock._checks import is_traced, placed, size, strength
-from jaxrock._parameters import Owner, parameter
-from jaxrock.motions.motion import AbstractMotion, Piece, Scalar, Scaled
-from jaxrock.motions.record import AbstractChosen, Padded, Record, Straight, roomy
+from jaxrock._arguments.parameters import Owner, parameter
+from jaxrock._arguments.ranges import size, strength
+from jaxrock._core.arrays import is_traced, to_device
+from jaxrock._core.types import Scalar
+from jaxrock.compiler.hints import select
+from jaxrock.motions.motion import AbstractMotion, Piece, Scaled
+from jaxrock.motions.record import AbstractChosen, AbstractPolyline, Padded, Record, roomy
 from jaxrock.motions.shaking import Bounds, Envelope
-from jaxrock.numerics.choice import where
 
 
 class JoinedRecords(Owner):
@@ -46,8 +48,10 @@ class JoinedRecords(Owner):
         samples = library.pad(samples, (0, places - samples.size))
         dt = library.pad(dt, (0, owners - dt.size), mode="edge")
         with jax.ensure_compile_time_eval():
-            first, count, owner = (placed(np.pad(x, (0, n - x.size), mode="edge").astype(np.int32)) for x, n in whole)
-            samples, dt = (x if library is jnp else placed(x) for x in (samples, dt))
+            first, count, owner = (
+                to_device(np.pad(x, (0, n - x.size), mode="edge").astype(np.int32)) for x, n in whole
+            )
+            samples, dt = (x if library is jnp else to_device(x) for x in (samples, dt))
         return cls(samples, dt, first, count, owner, roomy(int(sizes.max())))
 
     @property
@@ -56,7 +60,7 @@ class JoinedRecords(Owner):
         return jnp.arange(self.samples.size, dtype=jnp.int32) - self.first[self.owner]
 
 
-class _InPlace(Straight):
+class _InPlace(AbstractPolyline):
     """All records as one motion, of which one record's pieces are followed; time counts from that record's start.
 
     No array depends on the chosen record.
@@ -82,7 +86,7 @@ class _InPlace(Straight):
     @property
     def lengths(self) -> Inexact[Array, " pieces"]:
         many = self.joined
-        return where(self._left > 0, many.dt[many.owner], jnp.inf)[:-1]
+        return select(self._left > 0, many.dt[many.owner], jnp.inf)[:-1]
 
     def length(self, piece: Piece) -> Scalar:
         return self.joined.dt[self.record]
@@ -96,7 +100,7 @@ class _InPlace(Straight):
     @property
     def envelope(self) -> Envelope:
         many, values = self.joined, self.bounds
-        values = where(self._left[:-1] > 0, values, 0.0)
+        values = select(self._left[:-1] > 0, values, 0.0)
         peaks = jax.ops.segment_max(values, many.owner[:-1], many.dt.size, indices_are_sorted=True)
         return Envelope(Bounds(values, self.sure, left=self._left[:-1], peak=peaks[self.record]), None)
 
@@ -114,7 +118,7 @@ class Chosen(AbstractChosen):
         many, places = self.joined, jnp.arange(self.joined.longest)
         first, count, dt = (x[self.record] for x in (many.first, many.count, many.dt))
         samples = many.samples[jnp.minimum(first + places, many.samples.size - 1)]
-        return Padded(self.sure * where(places < count, samples, 0.0), dt, dt * (count - 1))
+        return Padded(self.sure * select(places < count, samples, 0.0), dt, dt * (count - 1))
 
     @property
     def knots(self) -> Inexact[Array, " knots"]:

@@ -6,8 +6,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxrock._checks import shown
-from jaxrock._words import meant
+from jaxrock._core.arrays import shown
+from jaxrock._core.did_you_mean import did_you_mean
 from jaxrock.motions import intensity
 from jaxrock.motions.files.parsing import NUMBER
 from jaxrock.motions.motion import AbstractMotion
@@ -69,7 +69,7 @@ def measure_of(name: str, value: str | Callable) -> Measure:
     if callable(value) and not isinstance(value, type):
         return Measure(getattr(value, "__name__", type(value).__name__), value)
     words = ", ".join(repr(word) for word in NAMES)
-    told = f"must be one of {words}, or a function of a motion, but is {shown(value)}.{meant(value, NAMES)}"
+    told = f"must be one of {words}, or a function of a motion, but is {shown(value)}.{did_you_mean(value, NAMES)}"
     raise ValueError(f"Argument `{name}` {told}")
 
 

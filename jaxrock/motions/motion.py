@@ -11,18 +11,19 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Inexact, Int
 
-from jaxrock._arguments import arguments
-from jaxrock._checks import Values, delay, factor, if_known, not_nan, of_each, with_throw
-from jaxrock._described import described
-from jaxrock._parameters import Owner, check_declared, parameter, set_parameters
-from jaxrock.motions.finer import Finer
+from jaxrock._arguments.annotations import arguments
+from jaxrock._arguments.parameters import Owner, check_declared, parameter, set_parameters
+from jaxrock._arguments.ranges import delay, factor, if_known, not_nan, with_throw
+from jaxrock._arguments.repr import described
+from jaxrock._core.arrays import Values, of_each
+from jaxrock._core.types import Scalar
+from jaxrock.compiler.hints import select
+from jaxrock.motions.merged_knots import MergedKnots
 from jaxrock.motions.nesting import check_nesting
-from jaxrock.motions.pieces import Lasting, acceleration_at
+from jaxrock.motions.pieces import Extent, acceleration_at
 from jaxrock.motions.shaking import Bounds, Envelope, sum_of_series
-from jaxrock.numerics.choice import where
-from jaxrock.numerics.lookup import pick
+from jaxrock.numerics.lookup import take
 
-Scalar = Inexact[Array, ""]
 Piece = Int[Array, ""]  # number of a smooth piece
 
 
@@ -47,15 +48,15 @@ class AbstractMotion(Owner):
 
     def length(self, piece: Piece) -> Scalar:
         """Return the duration of one piece [s]."""
-        return pick(self.lengths, piece)
+        return take(self.lengths, piece)
 
     @property
-    def lasting(self) -> Lasting:
+    def lasting(self) -> Extent:
         """The last piece with a positive length, and whether time runs forward in every piece."""
-        return Lasting.of(self.lengths)
+        return Extent.of(self.lengths)
 
     @property
-    def lateness(self) -> Scalar | None:
+    def time_rounding(self) -> Scalar | None:
         """Bound of the relative timing error of parts through rounding of times [s]; None: `lengths` are exact."""
         return None
 
@@ -185,12 +186,12 @@ class AtTheSameTimes(_Changed):
         return self.motion.length(piece)
 
     @property
-    def lasting(self) -> Lasting:
+    def lasting(self) -> Extent:
         return self.motion.lasting
 
     @property
-    def lateness(self) -> Scalar | None:
-        return self.motion.lateness
+    def time_rounding(self) -> Scalar | None:
+        return self.motion.time_rounding
 
     @property
     def following(self) -> Int[Array, " knots"] | None:
@@ -250,15 +251,15 @@ class Shifted(_Changed):
         return jnp.concatenate([jnp.full_like(inner[:1], self.delay), inner])
 
     def length(self, piece: Piece) -> Scalar:
-        return where(piece > 0, self.motion.length(jnp.maximum(piece - 1, 0)), self.delay)
+        return select(piece > 0, self.motion.length(jnp.maximum(piece - 1, 0)), self.delay)
 
     @property
-    def lasting(self) -> Lasting:
+    def lasting(self) -> Extent:
         return self.motion.lasting.after(self.delay)
 
     @property
-    def lateness(self) -> Scalar | None:
-        return self.motion.lateness
+    def time_rounding(self) -> Scalar | None:
+        return self.motion.time_rounding
 
     @property
     def following(self) -> Int[Array, " knots"] | None:
@@ -279,11 +280,11 @@ class Shifted(_Changed):
 
     def series(self, piece: Piece, local: Scalar, unit: Scalar, order: int) -> list[Scalar]:
         inner = self.motion.series(jnp.maximum(piece - 1, 0), local, unit, order)
-        return [where(piece > 0, u, 0.0) for u in inner]
+        return [select(piece > 0, u, 0.0) for u in inner]
 
     def vertical_series(self, piece: Piece, local: Scalar, unit: Scalar, order: int) -> list[Scalar] | None:
         inner = self.motion.vertical_series(jnp.maximum(piece - 1, 0), local, unit, order)
-        return None if inner is None else [where(piece > 0, v, 0.0) for v in inner]
+        return None if inner is None else [select(piece > 0, v, 0.0) for v in inner]
 
 
 class _Together(AbstractMotion):
@@ -295,21 +296,21 @@ class _Together(AbstractMotion):
         """The two motions."""
 
     @property
-    def _finer(self) -> Finer:
+    def _finer(self) -> MergedKnots:
         first, second = self._both
-        return Finer(first.knots, second.knots)
+        return MergedKnots(first.knots, second.knots)
 
     @property
     def knots(self) -> Inexact[Array, " knots"]:
         return self._finer.knots
 
     @property
-    def lateness(self) -> Scalar | None:
+    def time_rounding(self) -> Scalar | None:
         # The times of a shifted part are rounded like those of the whole sum.
         parts, knots = jax.tree.leaves(self._both, is_leaf=lambda node: isinstance(node, Shifted)), self.knots
         if not any(isinstance(part, Shifted) for part in parts):
             return None
-        own = (motion.lateness for motion in self._both)
+        own = (motion.time_rounding for motion in self._both)
         return sum((late for late in own if late is not None), jnp.finfo(knots.dtype).eps * knots[-1])
 
     @property

@@ -5,31 +5,31 @@ A line of many periods costs as much as one of two: see `_peaks_of_long_lines`.
 
 import numpy as np
 
-from jaxrock.motions.straight import Straight
+from jaxrock.motions.piecewise_linear import PiecewiseLinear
 
 _PARTS = 80  # parts of a period, for peaks
 _AT_A_TIME = 1 << 16  # lines, or parts of lines, whose states are in memory together
 _GONE = 40.0  # number of e-foldings after which an oscillation is below rounding
 
 
-def peaks_of_oscillator(lines: Straight, period: float, damping: float) -> tuple[float, float]:
+def peaks_of_oscillator(lines: PiecewiseLinear, period: float, damping: float) -> tuple[float, float]:
     """Return the peak displacement [m] and velocity [m/s] of an oscillator relative to the ground.
 
     With s = omega (-damping + i sqrt(1 - damping^2)) and z' = s z + ground acceleration, the displacement is
     -Im z/Im s: a recursion of one complex number.
     """
-    lines = Straight(*(np.append(part, last) for part, last in zip(lines, (0.0, 0.0, period))))
+    lines = PiecewiseLinear(*(np.append(part, last) for part, last in zip(lines, (0.0, 0.0, period))))
     s = 2 * np.pi / period * complex(-damping, np.sqrt(1 - damping**2))
     state, peaks = 0j, np.zeros(2)
     for first in range(0, lines.length.size, _AT_A_TIME):
-        some = Straight(*(part[first : first + _AT_A_TIME] for part in lines))
+        some = PiecewiseLinear(*(part[first : first + _AT_A_TIME] for part in lines))
         states = _recursion(some, s, state)
         state = states[-1]
         peaks = np.maximum(peaks, _peaks_of_lines(some, states, s, period))
     return float(peaks[0]), float(peaks[1])
 
 
-def _peaks_of_lines(lines: Straight, states: np.ndarray, s: complex, period: float) -> np.ndarray:
+def _peaks_of_lines(lines: PiecewiseLinear, states: np.ndarray, s: complex, period: float) -> np.ndarray:
     """Return the peaks of displacement and velocity within some lines, from the states z at their ends."""
     window = 2 * np.pi / s.imag  # a period of the damped oscillation, or its decay if shorter
     window = min(window, max(_GONE / -s.real, period)) if s.real else window
@@ -46,7 +46,7 @@ def _peaks_of_lines(lines: Straight, states: np.ndarray, s: complex, period: flo
     return peaks
 
 
-def _peaks_of_long_lines(lines: Straight, states: np.ndarray, s: complex, window: float) -> np.ndarray:
+def _peaks_of_long_lines(lines: PiecewiseLinear, states: np.ndarray, s: complex, window: float) -> np.ndarray:
     """Return peaks within lines of many periods: they lie in the first or in the last period.
 
     The oscillator follows a straight line and rings about it. Sampled at one phase, from period to period, its distance
@@ -56,12 +56,12 @@ def _peaks_of_long_lines(lines: Straight, states: np.ndarray, s: complex, window
     a, b, length = lines
     slope, first = (b - a) / length, np.full_like(length, window)
     parts = np.full(length.size, int(np.ceil(_PARTS * window * abs(s) / (2 * np.pi))))
-    peaks = _peaks_of_parts(Straight(a, a + slope * first, first), states, parts, s)
+    peaks = _peaks_of_parts(PiecewiseLinear(a, a + slope * first, first), states, parts, s)
     last = _after(a, slope, states, length - first, s)
-    return np.maximum(peaks, _peaks_of_parts(Straight(b - slope * first, b, first), last, parts, s))
+    return np.maximum(peaks, _peaks_of_parts(PiecewiseLinear(b - slope * first, b, first), last, parts, s))
 
 
-def _peaks_of_parts(lines: Straight, states: np.ndarray, parts: np.ndarray, s: complex) -> np.ndarray:
+def _peaks_of_parts(lines: PiecewiseLinear, states: np.ndarray, parts: np.ndarray, s: complex) -> np.ndarray:
     """Return peaks within lines cut into equal parts, from the states at the beginnings of the lines."""
     peaks, total = np.zeros(2), np.cumsum(parts)
     for group in np.split(np.arange(parts.size), np.flatnonzero(np.diff(total // _AT_A_TIME)) + 1):
@@ -72,11 +72,11 @@ def _peaks_of_parts(lines: Straight, states: np.ndarray, parts: np.ndarray, s: c
         begin = a + slope * step * place
         after = _after(a, slope, states[row], step * (place + 1), s)
         before = np.where(place == 0, states[row], np.roll(after, 1))
-        peaks = np.maximum(peaks, _peaks_between(Straight(begin, begin + slope * step, step), before, after, s))
+        peaks = np.maximum(peaks, _peaks_between(PiecewiseLinear(begin, begin + slope * step, step), before, after, s))
     return peaks
 
 
-def _peaks_between(lines: Straight, before: np.ndarray, after: np.ndarray, s: complex) -> np.ndarray:
+def _peaks_between(lines: PiecewiseLinear, before: np.ndarray, after: np.ndarray, s: complex) -> np.ndarray:
     """Return peaks within lines much shorter than a period, from the states at their ends."""
     (place, next_place), (speed, next_speed), (slope, next_slope) = (
         (-(s**k * before).imag / s.imag, -(s**k * after).imag / s.imag) for k in range(3)
@@ -90,12 +90,12 @@ def _peaks_between(lines: Straight, before: np.ndarray, after: np.ndarray, s: co
     )
 
 
-def _rows(lines: Straight, rows: np.ndarray) -> Straight:
+def _rows(lines: PiecewiseLinear, rows: np.ndarray) -> PiecewiseLinear:
     """Select some of the lines."""
-    return Straight(*(part[rows] for part in lines))
+    return PiecewiseLinear(*(part[rows] for part in lines))
 
 
-def _recursion(lines: Straight, s: complex, state: complex) -> np.ndarray:
+def _recursion(lines: PiecewiseLinear, s: complex, state: complex) -> np.ndarray:
     """Return z at the ends of all lines, from its initial value."""
     from scipy.signal import lfilter
 

@@ -8,10 +8,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from jaxrock._checks import is_traced, watched
-from jaxrock._quickly import quickly
+from jaxrock._core.arrays import is_traced
+from jaxrock._core.types import Scalar
 from jaxrock.blocks.rigid import GRAVITY
-from jaxrock.motions.motion import AbstractMotion, Scalar
+from jaxrock.compiler import checks
+from jaxrock.compiler.hints import jit_low_effort
+from jaxrock.motions.motion import AbstractMotion
 from jaxrock.motions.record import with_room
 from jaxrock.numerics.gauss_legendre import gauss_legendre
 
@@ -59,7 +61,7 @@ def _fine_enough(motion: Any, peaks: Callable) -> tuple:
         return tuple(found)
     if is_traced(wanted):
         message = "Argument `motion` must have at most 20 cycles within a piece where it is traced"
-        return watched(tuple(found), message, jnp.any(wanted > 0))
+        return checks.error_if(tuple(found), jnp.any(wanted > 0), message)
     most = float(np.max(np.asarray(wanted)))
     if not most > 0:  # also for NaN
         return tuple(found)
@@ -76,7 +78,7 @@ def too_long(most: float, lasts: float) -> ValueError:
     )
 
 
-@quickly(static_argnums=1)
+@jit_low_effort(static_argnums=1)
 def _peaks_of(motion: AbstractMotion, room: int | None):
     """Return the peaks of acceleration [g] and velocity [m/s], the last velocity, and the number of parts needed.
 

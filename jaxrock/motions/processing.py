@@ -13,12 +13,11 @@ import scipy.interpolate
 import scipy.signal
 from jaxtyping import ArrayLike
 
-from jaxrock._arguments import arguments, at_least, known, word_of
-from jaxrock._checks import (
+from jaxrock._arguments.annotations import arguments, at_least, known, word_of
+from jaxrock._arguments.parameters import check_single
+from jaxrock._arguments.ranges import (
     Range,
-    Values,
     as_meant,
-    check_known,
     delay,
     factor as any_factor,
     not_negative,
@@ -27,7 +26,8 @@ from jaxrock._checks import (
     size,
     strength,
 )
-from jaxrock._parameters import check_single
+from jaxrock._core.arrays import Values
+from jaxrock._core.one_program import check_known
 from jaxrock.blocks.rigid import GRAVITY, LENGTHS
 from jaxrock.motions.filters import LOWEST, NARROWEST, butterworth, of_displacement, of_velocity, smoothed
 from jaxrock.motions.intensity import peak_acceleration, peak_velocity

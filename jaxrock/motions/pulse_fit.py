@@ -16,10 +16,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxrock._arguments import arguments, at_least, pair, word_of
-from jaxrock._checks import check_known, finite, scalar, shown
-from jaxrock._described import described
-from jaxrock._parameters import check_single
+from jaxrock._arguments.annotations import arguments, at_least, pair, word_of
+from jaxrock._arguments.parameters import check_single
+from jaxrock._arguments.ranges import finite, scalar
+from jaxrock._arguments.repr import described
+from jaxrock._core.arrays import shown
+from jaxrock._core.one_program import check_known
 from jaxrock.blocks.rigid import GRAVITY
 from jaxrock.motions.motion import AbstractMotion
 from jaxrock.motions.pulses import UNITS

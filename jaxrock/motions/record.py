@@ -11,21 +11,23 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Inexact
 
-from jaxrock._arguments import arguments
-from jaxrock._checks import Values, is_traced, not_negative, of_each, placed, size, strength, with_throw
-from jaxrock._label import Label
-from jaxrock._parameters import parameter
-from jaxrock._precision import frames_of_the_package
-from jaxrock.motions.motion import AbstractMotion, Piece, Scalar
-from jaxrock.motions.pieces import Lasting
-from jaxrock.numerics.choice import where
+from jaxrock._arguments.annotations import arguments
+from jaxrock._arguments.parameters import parameter
+from jaxrock._arguments.ranges import not_negative, size, strength, with_throw
+from jaxrock._core.arrays import Values, is_traced, of_each, to_device
+from jaxrock._core.label import Label
+from jaxrock._core.precision import frames_of_the_package
+from jaxrock._core.types import Scalar
+from jaxrock.compiler.hints import select
+from jaxrock.motions.motion import AbstractMotion, Piece
+from jaxrock.motions.pieces import Extent
 
 _SHORT = 64  # samples; shorter records are not padded but compiled for their own length
 STRONGEST = 3.0  # [g]; few records exceed it
 _is_in_g = contextvars.ContextVar("is_in_g", default=False)  # whether samples are known to be in g
 
 
-class Straight(AbstractMotion):
+class AbstractPolyline(AbstractMotion):
     """Straight lines between samples."""
 
     samples: eqx.AbstractVar[Inexact[Array, "*batch n"]]
@@ -72,7 +74,7 @@ class Origin(NamedTuple):
     file: str = ""
 
 
-class Record(Straight):
+class Record(AbstractPolyline):
     """An accelerogram: straight lines between equally spaced samples.
 
     **Arguments:**
@@ -135,7 +137,7 @@ class Record(Straight):
         count = self.samples.shape[-1]
         if is_traced(self.dt):  # a NumPy array would become a constant of the program
             return self.dt * jnp.arange(count)
-        return placed(np.asarray(self.dt) * np.arange(count, dtype=self.dt.dtype))
+        return to_device(np.asarray(self.dt) * np.arange(count, dtype=self.dt.dtype))
 
     @property
     def lengths(self) -> Inexact[Array, " pieces"]:
@@ -146,8 +148,8 @@ class Record(Straight):
         return self.lengths[0]
 
     @property
-    def lasting(self) -> Lasting:
-        return Lasting.of_equal(self.dt, self.samples.shape[-1] - 1)
+    def lasting(self) -> Extent:
+        return Extent.of_equal(self.dt, self.samples.shape[-1] - 1)
 
 
 def record_in_g(acceleration: Values, dt: ArrayLike, name: str = "", origin: Origin | None = None) -> Record:
@@ -180,7 +182,7 @@ class AbstractChosen(AbstractMotion):
         """The record with an array of its own samples."""
 
 
-class Padded(Straight):
+class Padded(AbstractPolyline):
     """A record padded with zero samples at its end."""
 
     samples: Inexact[Array, "*batch n"] = parameter("g", strength, axes=1)
@@ -193,14 +195,14 @@ class Padded(Straight):
 
     @property
     def lengths(self) -> Inexact[Array, " pieces"]:
-        return where(self.dt * jnp.arange(self.samples.shape[-1] - 1) < self.finish, self.dt, 0.0)
+        return select(self.dt * jnp.arange(self.samples.shape[-1] - 1) < self.finish, self.dt, 0.0)
 
     def length(self, piece: Piece) -> Scalar:
-        return where(self.dt * piece < self.finish, self.dt, 0.0)
+        return select(self.dt * piece < self.finish, self.dt, 0.0)
 
     @property
-    def lasting(self) -> Lasting:
-        return Lasting.of_equal(self.dt, self.samples.shape[-1] - 1, self.finish)
+    def lasting(self) -> Extent:
+        return Extent.of_equal(self.dt, self.samples.shape[-1] - 1, self.finish)
 
 
 def padded(motion: AbstractMotion) -> AbstractMotion:
@@ -250,5 +252,5 @@ def _with_room(samples, dt, more: int):
         roomier = jnp.pad(samples, room)
     else:
         with jax.ensure_compile_time_eval():  # known also under tracing
-            roomier = placed(np.pad(np.asarray(samples), room))
+            roomier = to_device(np.pad(np.asarray(samples), room))
     return roomier, dt, of_each(lambda dt: dt * (samples.shape[-1] - 1), dt)

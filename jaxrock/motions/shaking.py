@@ -6,9 +6,8 @@ from typing import NamedTuple, overload
 import jax.numpy as jnp
 from jaxtyping import Array, Inexact, Int
 
+from jaxrock._core.types import Scalar
 from jaxrock.numerics.polynomial import horner, rescaled, shifted
-
-Scalar = Inexact[Array, ""]
 
 
 class Shaking(NamedTuple):

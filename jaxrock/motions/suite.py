@@ -13,12 +13,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxrock._arguments import arguments, list_of
-from jaxrock._checks import Values, direction, is_traced, placed, shown, watched
-from jaxrock._described import described
-from jaxrock._named import AbstractNamed
-from jaxrock._parameters import broadcast, leaves_of, one_of_many, shared
-from jaxrock._settings import called_by_users
+from jaxrock._arguments.annotations import arguments, list_of
+from jaxrock._arguments.parameters import broadcast, leaves_of, one_of_many, shared
+from jaxrock._arguments.ranges import direction
+from jaxrock._arguments.repr import described
+from jaxrock._core.arrays import Values, is_traced, shown, to_device
+from jaxrock._core.named import AbstractNamed
+from jaxrock._core.settings import called_by_users
+from jaxrock.compiler import checks
 from jaxrock.motions.components import Components
 from jaxrock.motions.joined_records import Chosen, JoinedRecords
 from jaxrock.motions.motion import AbstractMotion, Scaled, Shifted, WithVertical
@@ -106,13 +108,13 @@ class Suite(AbstractNamed):
         self.sources = self.names if sources is None else sources
         peaks = zip(*map(_peaks, self.groups))
         self.peak_acceleration, self.peak_velocity = (
-            jnp.concatenate(x) if is_traced(x) else placed(np.concatenate(x)) for x in peaks
+            jnp.concatenate(x) if is_traced(x) else to_device(np.concatenate(x)) for x in peaks
         )
         if is_traced(self.peak_acceleration):
             peaks = self.peak_acceleration, self.peak_velocity
             failed = ~jnp.all((peaks[0] > _LEAST) & (peaks[1] > 0))
-            self.peak_acceleration, self.peak_velocity = watched(
-                peaks, "Argument `motions` must move the ground", failed
+            self.peak_acceleration, self.peak_velocity = checks.error_if(
+                peaks, failed, "Argument `motions` must move the ground"
             )
             return
         # A motion without duration, such as a record of one sample, moves nothing.
@@ -140,7 +142,7 @@ class Suite(AbstractNamed):
         motion, failed = self._chosen(number.astype(jnp.int32)), (number < 0) | (number >= len(self))
         whole, own = eqx.partition(motion, shared(motion))  # exclude shared arrays, which would be copied per lane
         message = f"The number of a motion must be in [0, {len(self) - 1}]"
-        return eqx.combine(watched(own, message, failed), whole)
+        return eqx.combine(checks.error_if(own, failed, message), whole)
 
     def _chosen(self, number) -> AbstractMotion:
         """Return the motion of a traced number."""

@@ -5,16 +5,16 @@ import math
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Inexact
+from jaxtyping import Array, Inexact
 
-Real = Inexact[ArrayLike, "..."]
+from jaxrock._core.types import RealLike
 
 # Nodes closer together than this are summed as a power series; others are divided.
 _CLOSE = 1.0
 _TERMS = 14
 
 
-def exponential_difference(*nodes: Real) -> Inexact[Array, "..."]:
+def exponential_difference(*nodes: RealLike) -> Inexact[Array, "..."]:
     """Divided difference of e^x at the given nodes: positive, symmetric in them, and smooth where they meet.
 
     With one node it is e^x, with two (e^x - e^y)/(x - y), with n + 1 equal ones e^x/n!. The response of a linear system
@@ -92,12 +92,12 @@ def _power_series(offsets: list[Array], centre: Array) -> Array:
     return jnp.exp(centre) * total
 
 
-def growth_ratio(x: Real) -> Inexact[Array, "..."]:
+def growth_ratio(x: RealLike) -> Inexact[Array, "..."]:
     """Return (e^x - 1)/x, smooth through 0."""
     return exponential_difference(x, 0.0)
 
 
-def logarithm_ratio(y: Real) -> Inexact[Array, "..."]:
+def logarithm_ratio(y: RealLike) -> Inexact[Array, "..."]:
     """Return -log(1 - y)/y for y < 1, smooth through 0."""
     y = jnp.asarray(y)
     small = jnp.abs(y) < 0.05

@@ -1,15 +1,15 @@
 """Elementary functions that vectorise; XLA's own, in double precision on CPUs, call a scalar function."""
 
 import math
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Inexact
+from jaxtyping import Array, Bool
 
-from jaxrock.numerics.choice import where
-from jaxrock.numerics.compound import Compound
-
-Real = Inexact[Array, "..."]
+from jaxrock._core.types import Real
+from jaxrock.compiler import MacroPrimitive
+from jaxrock.compiler.hints import select
 
 # Coefficients in x^2 of sin(x)/x and cos(x): interpolation at Chebyshev points of x^2 in [0, 3.2], errors below 3e-17.
 _SINE = (
@@ -91,7 +91,7 @@ def _turned(operation, numbers, changes):
     return [sine, cosine], [cosine * moved, -sine * moved]
 
 
-_sine_cosine = Compound("sine_cosine", _near, _turned, results=2)
+_sine_cosine = MacroPrimitive("sine_cosine", _near, _turned, results=2)
 
 
 @jax.jit
@@ -119,7 +119,7 @@ def _anywhere(x):
     return [sign * sine, sign * cosine]
 
 
-_sine_cosine_of_any = Compound("sine_cosine_of_any", _anywhere, _turned, results=2)
+_sine_cosine_of_any = MacroPrimitive("sine_cosine_of_any", _anywhere, _turned, results=2)
 
 
 def logarithm(x: Real) -> Real:
@@ -143,7 +143,7 @@ def _logarithm_changed(operation, numbers, changes):
     return operation(*numbers), [changes[0] / numbers[0]]
 
 
-_logarithm = Compound("logarithm", _logarithm_written, _logarithm_changed)
+_logarithm = MacroPrimitive("logarithm", _logarithm_written, _logarithm_changed)
 
 
 def exponential(x: Real) -> Real:
@@ -165,7 +165,7 @@ def _exponential_written(x):
     # Two factors: 2^1024 overflows, but exp(709) does not.
     half = jnp.floor(power * 0.5)
     value = _horner(_EXPONENTIAL, rest) * power_of_two(half) * power_of_two(power - half)
-    return [where(power < info.minexp, 0.0, where(x > math.log(2) * info.maxexp, jnp.inf, value))]
+    return [select(power < info.minexp, 0.0, select(x > math.log(2) * info.maxexp, jnp.inf, value))]
 
 
 def _exponential_changed(operation, numbers, changes):
@@ -173,7 +173,7 @@ def _exponential_changed(operation, numbers, changes):
     return [value], [value * changes[0]]
 
 
-_exponential = Compound("exponential", _exponential_written, _exponential_changed)
+_exponential = MacroPrimitive("exponential", _exponential_written, _exponential_changed)
 
 
 @jax.jit
@@ -181,7 +181,7 @@ def exponential_less_one(x: Real) -> Real:
     """Return exp(x) - 1, to a few units of rounding of the result."""
     x = jnp.asarray(x)
     near = x * _horner(tuple(c / (k + 1) for k, c in enumerate(_EXPONENTIAL)), x)
-    return where(jnp.abs(x) < 0.346, near, exponential(x) - 1)
+    return select(jnp.abs(x) < 0.346, near, exponential(x) - 1)
 
 
 @jax.jit
@@ -189,7 +189,7 @@ def logarithm_of_one_and(x: Real) -> Real:
     """Return log(1 + x), to a few units of rounding of the result, where 1 + x is a positive normal number."""
     ratio = x / (2 + x)
     near = 2 * ratio * _horner(_LOGARITHM, ratio * ratio)
-    return where((x > -0.29) & (x < 0.41), near, logarithm(1 + x))
+    return select((x > -0.29) & (x < 0.41), near, logarithm(1 + x))
 
 
 @jax.jit
@@ -210,17 +210,17 @@ def arctangent_of(y: Real, x: Real) -> Real:
     """Return the angle of the point (x, y), in [-pi, pi], to a few units of rounding; zeros have signs, as in C."""
     high, wide = jnp.abs(y), jnp.abs(x)
     steep = high > wide
-    small, large = where(steep, wide, high), where(steep, high, wide)
-    share = where(small == large, where(large > 0, 1.0, 0.0), small / large)
+    small, large = select(steep, wide, high), select(steep, high, wide)
+    share = select(small == large, select(large > 0, 1.0, 0.0), small / large)
     beyond = share > 0.41421356237309503  # tan(pi/8)
-    part = where(beyond, (share - 1) / (share + 1), share)
+    part = select(beyond, (share - 1) / (share + 1), share)
     angle = part * _horner(_ARCTANGENT, part * part)
     # Each multiple of pi/4 is added with its rounding error.
-    angle = where(beyond, (angle + 3.061616997868383e-17) + math.pi / 4, angle)
-    angle = where(steep, (6.123233995736766e-17 - angle) + math.pi / 2, angle)
-    angle = where(_is_negative(x), (1.2246467991473532e-16 - angle) + math.pi, angle)
-    angle = where(jnp.isnan(x) | jnp.isnan(y), jnp.nan, angle)
-    return where(_is_negative(y), -angle, angle)
+    angle = select(beyond, (angle + 3.061616997868383e-17) + math.pi / 4, angle)
+    angle = select(steep, (6.123233995736766e-17 - angle) + math.pi / 2, angle)
+    angle = select(_is_negative(x), (1.2246467991473532e-16 - angle) + math.pi, angle)
+    angle = select(jnp.isnan(x) | jnp.isnan(y), jnp.nan, angle)
+    return select(_is_negative(y), -angle, angle)
 
 
 @jax.jit
@@ -234,10 +234,10 @@ def hyperbolic_arctangent(x: Real) -> Real:
     """Return artanh(x), to a few units of rounding; infinite at the ends."""
     size = jnp.abs(x)
     near = size * _horner(_LOGARITHM, x * x)
-    inside = 0.5 * logarithm((1 + size) / (1 - where(size < 1, size, 0.0)))
-    far = where(size < 1, inside, where(size == 1, jnp.inf, jnp.nan))
-    value = where(size < 0.17, near, far)
-    return where(x < 0, -value, value)
+    inside = 0.5 * logarithm((1 + size) / (1 - select(size < 1, size, 0.0)))
+    far = select(size < 1, inside, select(size == 1, jnp.inf, jnp.nan))
+    value = select(size < 0.17, near, far)
+    return select(x < 0, -value, value)
 
 
 @jax.jit
@@ -247,12 +247,12 @@ def hyperbolic_arcsine(x: Real) -> Real:
     inside = jnp.minimum(size, 1e9)  # beyond, arsinh is log(2 x) to rounding
     root = jnp.sqrt(inside * inside + 1)
     near = hyperbolic_arctangent(jnp.minimum(inside, 0.2) / root)
-    finite = where(size < jnp.inf, jnp.maximum(size, 1e9), 1.0)
-    far = where(size < jnp.inf, logarithm(where(size < 1e9, inside + root, finite)), jnp.inf)
-    far = far + where(size < 1e9, 0.0, math.log(2))
-    value = where(size < 0.17, near, far)
-    value = where(x < 0, -value, value)
-    return where(x == x, value, jnp.nan)
+    finite = select(size < jnp.inf, jnp.maximum(size, 1e9), 1.0)
+    far = select(size < jnp.inf, logarithm(select(size < 1e9, inside + root, finite)), jnp.inf)
+    far = far + select(size < 1e9, 0.0, math.log(2))
+    value = select(size < 0.17, near, far)
+    value = select(x < 0, -value, value)
+    return select(x == x, value, jnp.nan)
 
 
 @jax.jit
@@ -261,8 +261,8 @@ def hyperbolic_sine(x: Real) -> Real:
     size = jnp.abs(x)
     grown, half = exponential_less_one(jnp.minimum(size, 20.0)), exponential(size / 2)
     # Beyond 20, sinh is half of the exponential, which may overflow where sinh does not.
-    value = where(size < 20, 0.5 * (grown + grown / (grown + 1)), 0.5 * half * half)
-    return where(x > 0, value, where(x < 0, -value, x))
+    value = select(size < 20, 0.5 * (grown + grown / (grown + 1)), 0.5 * half * half)
+    return select(x > 0, value, select(x < 0, -value, x))
 
 
 @jax.jit
@@ -276,4 +276,32 @@ def hyperbolic_cosine(x: Real) -> Real:
 def hyperbolic_tangent(x: Real) -> Real:
     """Return tanh(x), to a few units of rounding."""
     grown = exponential_less_one(2 * jnp.minimum(jnp.abs(x), 30.0))
-    return where(x < 0, -grown, grown) / (grown + 2)
+    return select(x < 0, -grown, grown) / (grown + 2)
+
+
+def _logarithm_of_any(x, positive=logarithm, border=0):
+    """Extend a logarithm of finite numbers beyond its border to all numbers."""
+    inside = jnp.where(x > border, jnp.where(x < jnp.inf, positive(x), jnp.inf), -jnp.inf)
+    return jnp.where(x >= border, inside, jnp.nan)
+
+
+# Machine code computes JAX's operations by these.
+_IMPLEMENTATIONS: dict[str, Callable] = {
+    "exp": exponential,
+    "expm1": exponential_less_one,
+    "log": _logarithm_of_any,
+    "log1p": lambda x: _logarithm_of_any(x, logarithm_of_one_and, -1),
+    "sin": lambda x: sine_cosine_of_any(x)[0],
+    "cos": lambda x: sine_cosine_of_any(x)[1],
+    "tan": tangent,
+    "asin": arcsine,
+    "atan": lambda x: arctangent_of(x, jnp.ones_like(x)),
+    "atan2": arctangent_of,
+    "sinh": hyperbolic_sine,
+    "cosh": hyperbolic_cosine,
+    "tanh": hyperbolic_tangent,
+    "asinh": hyperbolic_arcsine,
+    "atanh": hyperbolic_arctangent,
+}
+for _name, _function in _IMPLEMENTATIONS.items():
+    MacroPrimitive.implement(_name, _function)

@@ -8,13 +8,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Bool, Complex, Inexact
+from jaxtyping import Array, ArrayLike, Complex, Inexact
 
+from jaxrock._core.types import Flag, Scalar
 from jaxrock.numerics.roots import implicit
 
-Scalar = Inexact[Array, ""]
-Flag = Bool[Array, ""]
-Values = Inexact[Array, "*values"]
+_Values = Inexact[Array, "*values"]
 _MOST_STRIDES = 10_000
 
 
@@ -137,7 +136,7 @@ class _View:
         return touching, jnp.where(touching, leaving, apart)
 
 
-def _below_parabola(value: Values, slope: Values, fall: Values) -> Values:
+def _below_parabola(value: _Values, slope: _Values, fall: _Values) -> _Values:
     """Return lengths on which value + slope x - fall x^2/2 stays positive, for a value of 0 or more."""
     root = jnp.sqrt(slope**2 + 2 * fall * value)
     rising = slope > 0

@@ -3,7 +3,7 @@
 import numpy as np
 from jaxtyping import Float
 
-from jaxrock._settings import kept_by_precision
+from jaxrock._core.settings import kept_by_precision
 
 
 @kept_by_precision

@@ -18,7 +18,7 @@ _UNDETERMINED = 1e10  # variance of undetermined combinations of parameters, in 
 _TO_THE_BOUND = 0.9  # largest share of the way to a bound by which a start is scattered
 
 
-class Problem(NamedTuple):
+class LeastSquares(NamedTuple):
     """The residuals to minimise: `at(point, samples)` gives residuals (n,) and their derivatives.
 
     Residuals past the first `samples` are zero; for a point without a result they are infinite. `scale`, `lower` and
@@ -42,7 +42,7 @@ class Progression(NamedTuple):
     noise: float
 
 
-class End(NamedTuple):
+class _DescentEnd(NamedTuple):
     """The end of one descent: its point, residuals and derivatives there, and whether that is a minimum."""
 
     point: Float[np.ndarray, " parameters"]
@@ -75,7 +75,9 @@ class Covariance(NamedTuple):
     correlation: float  # of neighbouring residuals
 
 
-def least_squares(problem: Problem, first: np.ndarray, progression: Progression, starts: int, seed: int) -> Minimum:
+def least_squares(
+    problem: LeastSquares, first: np.ndarray, progression: Progression, starts: int, seed: int
+) -> Minimum:
     """Find the least sum of squares from scattered starts, window after window.
 
     **Arguments:**
@@ -96,7 +98,7 @@ def least_squares(problem: Problem, first: np.ndarray, progression: Progression,
     return Minimum(*best, share)
 
 
-def _through_windows(problem: Problem, point: np.ndarray, progression: Progression) -> End:
+def _through_windows(problem: LeastSquares, point: np.ndarray, progression: Progression) -> _DescentEnd:
     """Descend from a start, from the first window to the last."""
     *early, last = progression.windows
     for samples in early:
@@ -104,13 +106,15 @@ def _through_windows(problem: Problem, point: np.ndarray, progression: Progressi
     return _descend(problem, point, last, 0.0, _MOST_STEPS, _TIGHT)
 
 
-def _inside(problem: Problem, points: np.ndarray, steps: np.ndarray) -> np.ndarray:
+def _inside(problem: LeastSquares, points: np.ndarray, steps: np.ndarray) -> np.ndarray:
     """Add steps to points, each parameter moving no further than most of its way to a bound."""
     room = np.where(steps > 0, problem.upper - points, problem.lower - points)
     return points + np.where(np.abs(steps) < _TO_THE_BOUND * np.abs(room), steps, _TO_THE_BOUND * room)
 
 
-def _descend(problem: Problem, begun: np.ndarray, samples: int, hold: float, most: int, enough: float) -> End:
+def _descend(
+    problem: LeastSquares, begun: np.ndarray, samples: int, hold: float, most: int, enough: float
+) -> _DescentEnd:
     """Run SciPy's descent from one start in a window. `hold`: weight of the prior that holds it near its start."""
     from scipy.optimize import least_squares
 
@@ -130,13 +134,13 @@ def _descend(problem: Problem, begun: np.ndarray, samples: int, hold: float, mos
     first, first_slopes = at(tuple(begun))
     has_result = bool(np.isfinite(first).all())
     if not has_result or not np.any(first @ first_slopes):
-        return End(begun, first, first_slopes, has_result)  # no result there, or the gradient is zero
+        return _DescentEnd(begun, first, first_slopes, has_result)  # no result there, or the gradient is zero
     bounds = problem.lower, problem.upper
     found = least_squares(
         residuals, begun, slopes, bounds, x_scale=problem.scale, ftol=enough, xtol=_STILL, gtol=None, max_nfev=most
     )
     left, last_slopes = at(tuple(found.x))
-    return End(found.x, left, last_slopes, bool(found.status > 0))
+    return _DescentEnd(found.x, left, last_slopes, bool(found.status > 0))
 
 
 def covariance(minimum: Minimum, scale: np.ndarray, scatter_is_known: bool) -> Covariance:

@@ -4,18 +4,18 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Int, Shaped
 
-from jaxrock.numerics.choice import where
+from jaxrock.compiler.hints import select
 
 _FEW = 8
 
 
-def pick(values: Shaped[Array, " n"], index: Int[Array, ""] | int) -> Shaped[Array, ""]:
+def take(values: Shaped[Array, " n"], index: Int[Array, ""] | int) -> Shaped[Array, ""]:
     """Return `values[index]`; few values are compared one by one, because a gather does not vectorise."""
     if values.shape[0] > _FEW:
         return values[index]
     value = values[0]
     for i in range(1, values.shape[0]):
-        value = where(index >= i, values[i], value)
+        value = select(index >= i, values[i], value)
     return value
 
 
@@ -29,7 +29,7 @@ def count_up_to(values: Shaped[Array, " n"], x: Shaped[ArrayLike, ""]) -> Int[Ar
         low, high = carry
         middle = (low + high) >> 1
         below = values[middle] <= x
-        return where(below, middle + 1, low), where(below, high, middle)
+        return select(below, middle + 1, low), select(below, high, middle)
 
     ends = jnp.int32(0), jnp.int32(values.shape[0])
     return jax.lax.while_loop(lambda carry: carry[0] < carry[1], halved, ends)[0]
@@ -45,7 +45,7 @@ def stretch_from(
     **Returns:** its index; its end, beyond x by more than rounding; whether there is an end above 0.
     """
     rounding = 64 * float(jnp.finfo(x.dtype).eps)
-    stretch = jnp.maximum(count_up_to(starts, x * where(upward, 1 + rounding, 1 - rounding)) - 1, 0)
-    following = where(upward, stretch + 1, stretch)
-    end = pick(starts, jnp.minimum(following, starts.size - 1))
+    stretch = jnp.maximum(count_up_to(starts, x * select(upward, 1 + rounding, 1 - rounding)) - 1, 0)
+    following = select(upward, stretch + 1, stretch)
+    end = take(starts, jnp.minimum(following, starts.size - 1))
     return stretch, end, (following < starts.size) & (end > 0)

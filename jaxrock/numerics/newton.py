@@ -8,13 +8,11 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Inexact
+from jaxtyping import Array, Bool
 
-from jaxrock.numerics.choice import where
-from jaxrock.numerics.polynomial import jet, tangent
-from jaxrock.numerics.xla_cpu import keep
-
-Scalar = Inexact[Array, ""]
+from jaxrock._core.types import Scalar
+from jaxrock.compiler.hints import materialize, select
+from jaxrock.numerics.polynomial import jet, value_and_slope
 
 _MORE = 6  # largest number of Newton steps in full degree
 
@@ -36,11 +34,11 @@ def is_found(x: Scalar, change: Scalar, share: float = 1e-7) -> Bool[Array, ""]:
 
 def _guess(values: tuple[Scalar, Scalar], slopes: tuple[Any, Any]) -> Scalar:
     """Return the root in [0, 1] of a parabola or, if the `slopes` at both ends are known, approximately of a cubic."""
-    sign = where(values[0] > 0, 1.0, -1.0)
+    sign = select(values[0] > 0, 1.0, -1.0)
     value, slope, fall = sign * values[0], sign * slopes[0], sign * values[1]
     curvature = fall - value - slope
     root = jnp.sqrt(jnp.maximum(slope * slope - 4 * value * curvature, 0.0))
-    share = where(slope > 0, slope + root, 2 * value) / where(slope > 0, -2 * curvature, root - slope)
+    share = select(slope > 0, slope + root, 2 * value) / select(slope > 0, -2 * curvature, root - slope)
     share = jnp.clip(share, 0.0, 1.0)
     if slopes[1] is None:
         return share
@@ -58,10 +56,10 @@ def root_between(degrees, terms: list[Scalar], start: Scalar, end: Scalar, value
     """
     width, order = end - start, len(terms) - 1
     far_slope = None if slopes[1] is None else width * slopes[1]
-    x = keep(start + width * _guess(values, (width * slopes[0], far_slope)), end)
+    x = materialize(start + width * _guess(values, (width * slopes[0], far_slope)), end)
 
     def nearer(x, degree):
-        value, slope = tangent(terms[: max(degree, order * degree // 16) + 1], x)
+        value, slope = value_and_slope(terms[: max(degree, order * degree // 16) + 1], x)
         change = value / slope
         return jnp.clip(x - change, start, end), jnp.abs(change)
 

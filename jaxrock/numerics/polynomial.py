@@ -11,15 +11,10 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Inexact
 
-from jaxrock.numerics.choice import where
-from jaxrock.numerics.compound import Compound, Zero, of_all
-from jaxrock.numerics.given import given, is_zero
-from jaxrock.numerics.xla_cpu import keep
-
-Scalar = Inexact[Array, ""]
-Flag = Bool[Array, ""]
+from jaxrock._core.types import Flag, Scalar
+from jaxrock.compiler import MacroPrimitive, custom_tangent
+from jaxrock.compiler.hints import materialize, select
 
 
 def rescaled(coefficients: list[Scalar], length: Scalar) -> list[Scalar]:
@@ -35,7 +30,7 @@ def _rescaled_written(length, *coefficients):
     return scaled
 
 
-_rescaled = Compound("rescaled", _rescaled_written, results=lambda count: count - 1)
+_rescaled = MacroPrimitive("rescaled", _rescaled_written, results=lambda count: count - 1)
 
 
 def _polynomial(x, *coefficients, derivatives: int):
@@ -51,20 +46,20 @@ def _polynomial(x, *coefficients, derivatives: int):
 
 def _polynomial_changed(polynomial, numbers, changes, derivatives: int):
     (x, *coefficients), (moved, *others) = numbers, changes
-    still = type(moved) is Zero
+    still = moved is None
     values = polynomial(x, *coefficients, derivatives=derivatives if still else derivatives + 1)
     change = [0.0] * (derivatives + 1) if still else [moved * slope for slope in values[1:]]
-    while others and type(others[-1]) is Zero:
+    while others and others[-1] is None:
         others.pop()
     if others:
-        others = [jnp.zeros_like(c) if type(d) is Zero else d for c, d in zip(coefficients, others)]
+        others = [jnp.zeros_like(c) if d is None else d for c, d in zip(coefficients, others)]
         own = polynomial(x, *others, derivatives=derivatives)
         change = own if still else [a + b for a, b in zip(change, own)]
     values = values[: derivatives + 1]
-    return values, [of_all(d, value) for d, value in zip(change, values)]
+    return values, change
 
 
-polynomial = Compound("polynomial", _polynomial, _polynomial_changed, lambda _, derivatives: derivatives + 1)
+polynomial = MacroPrimitive("polynomial", _polynomial, _polynomial_changed, lambda _, derivatives: derivatives + 1)
 
 
 def jet(coefficients: list[Scalar], x: Scalar, derivatives: int) -> list[Scalar]:
@@ -90,13 +85,13 @@ def _sum_of_products(*factors):
 def _sum_of_products_changed(operation, numbers, changes):
     half, moved = len(numbers) // 2, []
     for here, there in ((0, half), (half, 0)):
-        pairs = [(changes[here + k], numbers[there + k]) for k in range(half) if type(changes[here + k]) is not Zero]
+        pairs = [(changes[here + k], numbers[there + k]) for k in range(half) if changes[here + k] is not None]
         moved += operation(*(x for x, _ in pairs), *(y for _, y in pairs)) if pairs else []
     (value,) = operation(*numbers)
-    return [value], [of_all(sum(moved[1:], start=moved[0]), value)]
+    return [value], [sum(moved[1:], start=moved[0])]
 
 
-_products = Compound("sum_of_products", _sum_of_products, _sum_of_products_changed)
+_products = MacroPrimitive("sum_of_products", _sum_of_products, _sum_of_products_changed)
 
 
 def sum_of_products(first: Sequence, second: Sequence) -> Scalar:
@@ -110,7 +105,7 @@ def product_term(first: list, second: list, k: int) -> Any:
     return sum_of_products(*map(list, zip(*pairs))) if pairs else 0.0
 
 
-def tangent(coefficients: list[Scalar], x: Scalar) -> tuple[Scalar, Scalar]:
+def value_and_slope(coefficients: list[Scalar], x: Scalar) -> tuple[Scalar, Scalar]:
     """Return value and slope of a polynomial of degree 1 or more at x.
 
     Even and odd powers are evaluated side by side, for use where the last digit does not matter.
@@ -156,12 +151,12 @@ def _keeps_sign_written(length, sign, *coefficients):
         least = jnp.minimum(term, 0.0)
         if k < 4:
             leading = leading & (term >= 0)
-            least = where(leading, term, least)
+            least = select(leading, term, least)
         kept.append(least)
     return _polynomial(length, *kept, derivatives=0)
 
 
-_keeps_sign = Compound("keeps_sign", _keeps_sign_written)
+_keeps_sign = MacroPrimitive("keeps_sign", _keeps_sign_written)
 
 
 def fall_bound(coefficients: list[Scalar], sign: Scalar, order: int, length: Scalar | float = 1.0) -> Scalar:
@@ -177,7 +172,7 @@ def _fall_bound_written(length, sign, *coefficients, order: int):
     return _polynomial(length, *falls, derivatives=0)
 
 
-_fall_bound = Compound("fall_bound", _fall_bound_written)
+_fall_bound = MacroPrimitive("fall_bound", _fall_bound_written)
 
 
 def last_size(coefficients: list[Scalar]) -> Scalar:
@@ -195,7 +190,7 @@ def step_length(coefficients: list[Scalar], size: Scalar | float, cap: Scalar) -
     order, last = len(coefficients) - 1, last_size(coefficients)
     tiny = jnp.finfo(last.dtype).tiny
     ratio = size / jnp.maximum(last, tiny)
-    return jnp.minimum(where(last > tiny, root_of(ratio, order), jnp.inf), cap)
+    return jnp.minimum(select(last > tiny, root_of(ratio, order), jnp.inf), cap)
 
 
 def longest(order: int, dtype: Any) -> float:
@@ -241,14 +236,14 @@ def _clear_length_written(value, slope, fall):
     root = jnp.sqrt(jnp.maximum(slope * slope + 2 * fall * value, 0.0))
     rising = slope > 0
     # Take the form of the parabola's zero that adds, to avoid cancellation.
-    sum_ = keep(where(rising, slope + root, slope - root), fall)
-    above, below = where(rising, sum_, 2 * value), where(rising, fall, -sum_)
+    sum_ = materialize(select(rising, slope + root, slope - root), fall)
+    above, below = select(rising, sum_, 2 * value), select(rising, fall, -sum_)
     # Without a fall there is no zero, unless the value is zero and does not rise.
-    endless = where((value > 0) | rising, jnp.inf, 0.0)
-    return [where(below > 0, above / where(below > 0, below, 1.0), endless)]
+    endless = select((value > 0) | rising, jnp.inf, 0.0)
+    return [select(below > 0, above / select(below > 0, below, 1.0), endless)]
 
 
-_clear_length = Compound("clear_length", _clear_length_written)
+_clear_length = MacroPrimitive("clear_length", _clear_length_written)
 
 
 def first_event(coefficients: list[Scalar], watches: list[Watch], start: Scalar, needed: Flag) -> Landing:
@@ -276,11 +271,11 @@ def first_event(coefficients: list[Scalar], watches: list[Watch], start: Scalar,
             )[0]
             for w in watches
         ]
-        return [where(w.active, length, jnp.inf) for w, length in zip(watches, lengths)]
+        return [select(w.active, length, jnp.inf) for w, length in zip(watches, lengths)]
 
     def march(carry):
         x, radius, _, count = carry
-        stride = keep(jnp.clip(functools.reduce(jnp.minimum, clear(x, radius)), 0.0, radius), x)
+        stride = materialize(jnp.clip(functools.reduce(jnp.minimum, clear(x, radius)), 0.0, radius), x)
         reached = jnp.minimum(x + stride, 1.0)
         going = (stride > 2 * eps * reached) & (reached < 1) & (count < 100)
         # The parabola has to be a lower bound only as far as the next stride may go: a short radius is tight.
@@ -295,12 +290,12 @@ def first_event(coefficients: list[Scalar], watches: list[Watch], start: Scalar,
 
 def meet(x: Scalar, forcing: list[Scalar], level: Scalar) -> Scalar:
     """Return x, at which the series `forcing` meets `level`, with the derivatives of the root."""
-    return given(_meeting, x, (forcing, level))
+    return custom_tangent(_meeting, x, (forcing, level))
 
 
 def _meeting(x: Scalar, by: tuple, changes: tuple) -> Scalar:
     (forcing, _), (d_forcing, d_level) = by, changes
-    moved = [jnp.zeros_like(x) if is_zero(d) else d for d in d_forcing]
+    moved = [jnp.zeros_like(x) if d is None else d for d in d_forcing]
     slope = horner(derivative(forcing), x) if len(forcing) > 1 else jnp.zeros_like(x)
-    lack = (0.0 if is_zero(d_level) else d_level) - horner(moved, x)
-    return where(slope == 0, 0.0, lack / where(slope == 0, 1.0, slope))
+    lack = (0.0 if d_level is None else d_level) - horner(moved, x)
+    return select(slope == 0, 0.0, lack / select(slope == 0, 1.0, slope))

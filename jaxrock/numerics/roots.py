@@ -6,12 +6,11 @@ from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Inexact
 
-from jaxrock.numerics.given import along, given
+from jaxrock._core.types import Real
+from jaxrock.compiler import custom_tangent
 
-Tree = TypeVar("Tree")
-Real = Inexact[Array, "..."]
+_Tree = TypeVar("_Tree")
 _MOST_STEPS = 100
 
 
@@ -51,17 +50,31 @@ def carried(x: Real, step: Callable, times: int = 2) -> Real:
     return x
 
 
-def implicit(step: Callable, x: Tree, by: Any) -> Tree:
+def implicit(step: Callable, x: _Tree, by: Any) -> _Tree:
     """Return `x`, a root found without derivatives, with those of every order of the implicit function.
 
     `step(by, x)`, a function of a module, is Newton's distance to the root. It is computed only for derivatives.
     """
-    return given(_by_newton, x, by, step)
+    return custom_tangent(_by_newton, x, by, step)
 
 
-def _by_newton(step: Callable, x: Tree, by: Any, changes: Any) -> Tree:
+def tangent_along(function: Callable, by: Any, tangents: Any) -> Any:
+    """Return the tangent of `function(by)`, given those of `by` as rules of `custom_tangent` get them."""
+    flat: tuple[list, Any] = jax.tree.flatten(by)
+    leaves, structure = flat
+    known = structure.flatten_up_to(tangents)
+    moving = [(x, d) for x, d in zip(leaves, known) if d is not None]
+
+    def of_moving(*own):
+        rest = iter(own)
+        return function(structure.unflatten([x if d is None else next(rest) for x, d in zip(leaves, known)]))
+
+    return jax.jvp(of_moving, [x for x, _ in moving], [d for _, d in moving])[1]
+
+
+def _by_newton(step: Callable, x: _Tree, by: Any, changes: Any) -> _Tree:
     # At a root, the derivative of the step by x is one.
-    return jax.tree.map(jnp.negative, along(lambda by: step(by, x), by, changes))
+    return jax.tree.map(jnp.negative, tangent_along(lambda by: step(by, x), by, changes))
 
 
 def search_root(function: Callable, a: Real, b: Real) -> Real:

@@ -4,7 +4,7 @@ The package imports all others except `command_line`. Each kind of result has a 
 one of them.
 """
 
-from jaxrock._surface import shown as _shown
+from jaxrock._core.namespace import shown as _shown
 from jaxrock.plot.animations import animate as animate, save_animation as save_animation
 from jaxrock.plot.closed_forms import safety_regions as safety_regions, sine_regions as sine_regions
 from jaxrock.plot.drawings import scene as scene

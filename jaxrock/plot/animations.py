@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 
-from jaxrock._arguments import arguments, at_least, path_of
-from jaxrock._aside import written_aside
-from jaxrock._checks import Values, scalar, size
+from jaxrock._arguments.annotations import arguments, at_least, path_of
+from jaxrock._arguments.ranges import scalar, size
+from jaxrock._core.arrays import Values
+from jaxrock._core.atomic_files import written_atomically
 from jaxrock.blocks.edge import Edge
 from jaxrock.blocks.flexible import FlexibleBlock
 from jaxrock.blocks.rigid import Block
@@ -208,7 +209,7 @@ def save_animation(
     interval, path = own._interval, Path(path)  # `event_source.interval` is truncated to whole milliseconds
     kind = path.suffix.lower()
     if kind == ".gif":
-        with written_aside(path, replace=True, lasting=False) as aside:
+        with written_atomically(path, replace=True, lasting=False) as aside:
             film.save(aside, writer=_gif_writer(interval), dpi=dpi)
     elif kind == ".html":
         vars(own).pop("_html_representation", None)  # matplotlib's cached HTML may have another dpi
@@ -217,7 +218,7 @@ def save_animation(
             with_size = film.to_jshtml(fps=1000 / (round(interval) + 0.5), embed_frames=True)
         title = html.escape(path.stem)
         text = f"<!DOCTYPE html><meta charset='utf-8'><title>{title}</title>{with_size}"
-        with written_aside(path, replace=True, lasting=False) as aside:
+        with written_atomically(path, replace=True, lasting=False) as aside:
             aside.write_text(text, encoding="utf-8")
     elif kind == ".mp4":
         with matplotlib.rc_context({"animation.ffmpeg_path": _ffmpeg()}):
@@ -227,7 +228,7 @@ def save_animation(
                     "Argument `path` must end with .gif or .html, as .mp4 needs the program ffmpeg, which is not "
                     'there: install it, or `pip install "jaxrock[film]"`.'
                 )
-            with written_aside(path, replace=True, lasting=False) as aside:
+            with written_atomically(path, replace=True, lasting=False) as aside:
                 film.save(aside, writer=FFMpegWriter(fps=round(1000 / interval, 6), extra_args=more), dpi=dpi)
     else:
         raise ValueError(f"Argument `path` must end with .gif, .html or .mp4, but is {str(path)!r}.")

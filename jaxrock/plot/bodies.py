@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxrock._parameters import check_single
+from jaxrock._arguments.parameters import check_single
 from jaxrock.blocks.asymmetric import AsymmetricBlock
 from jaxrock.blocks.edge import Edge
 from jaxrock.blocks.flexible import FlexibleBlock
@@ -12,8 +12,7 @@ from jaxrock.blocks.rigid import GRAVITY, Block
 from jaxrock.models.equation import AbstractEquation
 from jaxrock.models.rolling import Rolling
 from jaxrock.models.spring import Spring
-
-AnyBlock = Block | AsymmetricBlock | FlexibleBlock
+from jaxrock.responses.arguments import AnyBlock
 
 
 class Shapes(NamedTuple):

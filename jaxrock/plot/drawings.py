@@ -5,8 +5,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import ArrayLike
 
-from jaxrock._checks import Range, scalar, strength
-from jaxrock._parameters import declared
+from jaxrock._arguments.parameters import declared
+from jaxrock._arguments.ranges import Range, scalar, strength
 from jaxrock.blocks.asymmetric import AsymmetricBlock
 from jaxrock.blocks.cantilever import unit_column
 from jaxrock.blocks.flexible import FlexibleBlock

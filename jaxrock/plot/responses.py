@@ -10,8 +10,8 @@ import numpy as np
 
 from jaxrock.flexible.response import FlexibleResponse
 from jaxrock.models.coefficients import Coefficients
+from jaxrock.motions.mirrored import has_vertical
 from jaxrock.motions.motion import AbstractMotion
-from jaxrock.motions.turned import has_vertical
 from jaxrock.plot.style import BLUE, GREY, RED, SAND, figure
 from jaxrock.responses.history import Response
 from jaxrock.status import Status

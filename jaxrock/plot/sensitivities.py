@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
-from jaxrock._checks import one_of
+from jaxrock._arguments.ranges import one_of
 from jaxrock.plot.style import BLUE, DURATION, RED, SAND, draw_cells, figure, in_order
 from jaxrock.studies.critical import Critical
 from jaxrock.studies.sensitivities import Sensitivity, SensitivityMap, SlopeStatus

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 import numpy as np
 
-from jaxrock._arguments import arguments
-from jaxrock._checks import shown
+from jaxrock._arguments.annotations import arguments
+from jaxrock._core.arrays import shown
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

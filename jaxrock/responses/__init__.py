@@ -3,7 +3,7 @@
 Imports `engines` and `flexible`. Start with `outcome`.
 """
 
-from jaxrock._surface import shown as _shown
+from jaxrock._core.namespace import shown as _shown
 from jaxrock.flexible.response import (
     FlexibleResponse as FlexibleResponse,
     outcome_flexible as outcome_flexible,

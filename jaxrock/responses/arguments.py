@@ -3,10 +3,13 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Inexact
+from jaxtyping import ArrayLike
 
-from jaxrock._checks import as_real, checked, is_traced, scalar, shown, strength, throwing
-from jaxrock._parameters import check_single
+from jaxrock._arguments.parameters import check_single
+from jaxrock._arguments.ranges import checked, scalar, strength
+from jaxrock._core.arrays import as_real, is_traced, shown
+from jaxrock._core.throwing import throwing
+from jaxrock._core.types import Scalar
 from jaxrock.blocks.asymmetric import AsymmetricBlock
 from jaxrock.blocks.flexible import FlexibleBlock
 from jaxrock.blocks.rigid import Block
@@ -17,7 +20,6 @@ from jaxrock.models.equation import AbstractEquation
 from jaxrock.models.rigid import Housner
 from jaxrock.motions.motion import AbstractMotion
 
-Scalar = Inexact[Array, ""]
 RigidBlock = Block | AsymmetricBlock
 AnyBlock = RigidBlock | FlexibleBlock
 

@@ -5,15 +5,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Inexact
 
-from jaxrock._arguments import arguments
-from jaxrock._checks import is_traced, scalar, shown
-from jaxrock._parameters import check_single
-from jaxrock._quickly import quickly
-from jaxrock._settings import called_by_users
-from jaxrock._tables import AbstractTable, over_time
+from jaxrock._arguments.annotations import arguments
+from jaxrock._arguments.parameters import check_single
+from jaxrock._arguments.ranges import scalar
+from jaxrock._arguments.tables import AbstractTable, over_time
+from jaxrock._core.arrays import is_traced, shown
+from jaxrock._core.settings import called_by_users
+from jaxrock._core.types import Scalar
 from jaxrock.blocks.asymmetric import AsymmetricBlock
 from jaxrock.blocks.restitution import Housner, ratio_of_inertia
 from jaxrock.blocks.rigid import Block
+from jaxrock.compiler.hints import jit_low_effort
 from jaxrock.engines.scene import Scene
 from jaxrock.models.equation import Angle, Rolled
 from jaxrock.models.rolling import RollingMoments
@@ -21,7 +23,6 @@ from jaxrock.motions.shaking import Shaking
 from jaxrock.responses.history import Response, evaluation
 from jaxrock.responses.own_block import check_own
 
-Scalar = Inexact[Array, ""]
 _WITHIN = 8  # parts of each step, at whose ends extremes are sought
 
 
@@ -110,7 +111,7 @@ def _ratio_of(scene: Scene, block: Block | AsymmetricBlock, given: ArrayLike | N
     return given
 
 
-@quickly()
+@jit_low_effort()
 def _contact(response: Response, block: Block | AsymmetricBlock, ratio: Scalar) -> Contact:
     if isinstance(block, Block):
         ratios, alphas, radii = (ratio, ratio), (block.alpha, block.alpha), (jnp.ones_like(block.p),) * 2

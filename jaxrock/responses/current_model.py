@@ -8,17 +8,17 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
-from jaxrock._checks import is_traced, put_down, throwing
-from jaxrock._guard import guarded
-from jaxrock._parameters import is_ours
+from jaxrock._arguments.parameters import is_ours
+from jaxrock._core.arrays import is_traced
+from jaxrock._core.throwing import throwing
 from jaxrock.blocks.asymmetric import AsymmetricBlock
 from jaxrock.blocks.rigid import Block, Side
+from jaxrock.compiler import checks, trace_function
 from jaxrock.engines.stepper import AbstractEngine
 from jaxrock.engines.taylor.careful import Series
 from jaxrock.models.equation import AbstractEquation, Angle
 from jaxrock.models.spring import Spring
 from jaxrock.models.user_equation import Equation, Functions
-from jaxrock.transforms.user_function import UserFunction
 
 
 def current_model(model: AbstractEquation, block: Block | AsymmetricBlock, *scene) -> AbstractEquation:
@@ -44,7 +44,7 @@ def current_model(model: AbstractEquation, block: Block | AsymmetricBlock, *scen
     example = jax.tree.map(lambda leaf: number, _example(kind))
 
     def current(node):
-        return UserFunction.of(node, number, number, number, example) if _is_functions(node) else node
+        return trace_function(node, number, number, number, example) if _is_functions(node) else node
 
     return jax.tree.map(current, model, is_leaf=_is_functions)
 
@@ -71,7 +71,7 @@ def standing(
             block = _none_where(jnp.stack(list(found.values())).any(), block)
             continue
         for message, applies in found.items():
-            block = guarded(block, applies, message)
+            block = checks.error_if(block, applies, message, collectable=False)
     return block
 
 
@@ -105,11 +105,11 @@ def _faults(model: AbstractEquation, block: Block | Side) -> dict[str, Bool[Arra
 
 _NO_BALANCE = (
     "The restoring moment of `model` must fall to zero at some rotation, where the block balances; one that does not "
-    "is for `Diffrax()`."
+    "is for `Diffrax()`"
 )
 _RIGHTS_AGAIN = (
     "The restoring moment of `model` must not right the block again between its balance and pi/2; one that does is for "
-    "`Diffrax()`."
+    "`Diffrax()`"
 )
 
 
@@ -125,7 +125,7 @@ def _example(kind: type) -> Block | Side:
     """Return a block of this kind, in the form that `as_functions_see` gives."""
 
     def made():
-        with put_down():
+        with checks.collect():
             return kind(*(jnp.asarray(x) for x in (0.2, 1.0, 0.9)))
 
     return jax.eval_shape(made)

@@ -9,14 +9,19 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Inexact, Int
 
-from jaxrock._arguments import arguments, at_least, pair
-from jaxrock._checks import Values, by_numpy_or_one_program, scalar, span, throwing
-from jaxrock._precision import say_if_single
-from jaxrock._quickly import quickly
-from jaxrock._settings import called_by_users
-from jaxrock._tables import AbstractTable, over_time
+from jaxrock._arguments.annotations import arguments, at_least, pair
+from jaxrock._arguments.ranges import scalar, span
+from jaxrock._arguments.tables import AbstractTable, over_time
+from jaxrock._core.arrays import Values
+from jaxrock._core.one_program import by_numpy_or_one_program
+from jaxrock._core.precision import say_if_single
+from jaxrock._core.settings import called_by_users
+from jaxrock._core.throwing import throwing
+from jaxrock._core.types import Real
 from jaxrock.blocks.flexible import FlexibleBlock
 from jaxrock.blocks.rigid import Block
+from jaxrock.compiler import checks, lane_function
+from jaxrock.compiler.hints import jit_low_effort
 from jaxrock.engines.scene import Scene
 from jaxrock.engines.state import Node, State
 from jaxrock.engines.stepper import AbstractEngine, AbstractStepper
@@ -26,14 +31,12 @@ from jaxrock.flexible.response import FlexibleResponse, simulate_flexible
 from jaxrock.models.equation import AbstractEquation
 from jaxrock.motions.motion import AbstractMotion
 from jaxrock.motions.record import padded
+from jaxrock.numerics.derivatives_of import with_derivatives_of
 from jaxrock.responses.arguments import USUAL, AnyBlock, RigidBlock, engine_of, start_of, steps_of_flexible
+from jaxrock.responses.compile_setup import numbers_of, with_numbers
 from jaxrock.responses.current_model import current_model, standing
-from jaxrock.responses.steps import Summary, followed, history_like, on_tape, started
-from jaxrock.status import Status, marked_result, still_if_none
-from jaxrock.transforms.differentiation import differentiable, with_derivatives_of
-from jaxrock.transforms.preparation import numbers_of, with_numbers
-
-Scalar = Inexact[Array, "..."]
+from jaxrock.responses.steps import Summary, history_like, started, steps_followed, steps_on_tape
+from jaxrock.status import Status, still_if_none
 
 
 class Response(AbstractTable):
@@ -82,17 +85,17 @@ class Response(AbstractTable):
         return self.summary.impact_count
 
     @property
-    def max_rotation(self) -> Scalar:
+    def max_rotation(self) -> Real:
         """Largest |rotation| within the duration [rad]; infinite if the block overturned."""
         return self.summary.max_rotation
 
     @property
-    def max_velocity(self) -> Scalar:
+    def max_velocity(self) -> Real:
         """Largest |angular velocity| within the duration [rad/s]; infinite if the block overturned."""
         return self.summary.max_velocity
 
     @property
-    def time_of_max(self) -> Scalar:
+    def time_of_max(self) -> Real:
         """Time of `max_rotation` [s]."""
         return self.summary.time_of_max
 
@@ -102,7 +105,7 @@ class Response(AbstractTable):
         return self.summary.overturned
 
     @property
-    def margin(self) -> Scalar:
+    def margin(self) -> Real:
         """Signed distance to overturning [-], as in `Outcome`."""
         return self.summary.margin
 
@@ -236,15 +239,19 @@ def simulate(
     time = path.equally_spaced(samples)
     rotation, velocity = _evaluate(path, time)
     response = Response(time, rotation, velocity, summary, path)
-    return response if throw else marked_result(response, given)
+    return response if throw else checks.nan_where_inputs_are(response, given)
 
 
-@quickly(follows_scenes=True)
+@jit_low_effort(follows_scenes=True)
 def _simulate(block, motion, model, initial, duration, engine) -> tuple[Summary, Trajectory]:
     p = block.p if isinstance(block, Block) else block.p1
     stop = motion.end + 10 / p if duration is None else jnp.asarray(duration)
     told = block, motion, model, initial, stop, engine
-    run = followed if engine.reverse else differentiable(followed, on_tape, None, "history", history_like)
+    run = (
+        steps_followed
+        if engine.reverse
+        else lane_function(steps_followed, reverse=steps_on_tape, key="history", results=history_like)
+    )
     steps, nodes, summary, numbers = run(told)
     stepper, _ = started(told)
     stepper = with_numbers(stepper, with_derivatives_of(numbers, numbers_of(stepper)))
@@ -258,7 +265,7 @@ def _evaluate(path: Trajectory, time):
     return _after_nodes(path.stepper, *path.before(time, path.nodes.start), path.duration, time.shape)
 
 
-@quickly(follows_scenes=True, static_argnames="shape")
+@jit_low_effort(follows_scenes=True, static_argnames="shape")
 def _after_nodes(stepper: AbstractStepper, node, elapsed, duration, shape):
     return at_times(evaluation(stepper), node, elapsed, duration, shape)
 
@@ -270,8 +277,13 @@ def evaluation(stepper: AbstractStepper) -> Callable:
         return lambda node, elapsed: _at((stepper, Node.of(node), elapsed))
     stepper = _moving_in_evaluation(stepper)
     in_lanes = stepper.engine.in_lanes
-    at = differentiable(
-        _at, _at, None, "evaluation", lambda given: (given[2], given[2]), in_lanes, derivatives="by directions"
+    at = lane_function(
+        _at,
+        reverse=_at,
+        key="evaluation",
+        results=lambda given: (given[2], given[2]),
+        in_lanes=in_lanes,
+        mode="jacobian by columns",
     )
 
     def found(node: Node | State, elapsed):
@@ -289,7 +301,7 @@ def _moving_in_evaluation(stepper: AbstractStepper) -> AbstractStepper:
     return replace(still, **moved)
 
 
-def _at(given) -> tuple[Scalar, Scalar]:
+def _at(given) -> tuple[Real, Real]:
     """Return rotation [rad] and angular velocity [rad/s] at a time after a node."""
     stepper, node, elapsed = given
     opening, speed = stepper.evaluate(node, elapsed)

@@ -4,18 +4,21 @@ from typing import Annotated, overload
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Bool, Inexact, Int
+from jaxtyping import Array, ArrayLike, Bool, Int
 
-from jaxrock._arguments import arguments, pair
-from jaxrock._parameters import check_single, in_real_numbers
-from jaxrock._precision import say_if_single
-from jaxrock._tables import AbstractTable, Column, scenes
+from jaxrock._arguments.annotations import arguments, pair
+from jaxrock._arguments.parameters import check_single, in_real_numbers
+from jaxrock._arguments.tables import AbstractTable, Column, scenes
+from jaxrock._core.precision import say_if_single
+from jaxrock._core.types import Real
 from jaxrock.blocks.flexible import FlexibleBlock
+from jaxrock.compiler import TwoPass, checks, lane_function
+from jaxrock.compiler.hints import select
 from jaxrock.engines.scene import Scene
 from jaxrock.engines.state import ROUNDING, State, all_moving, initial_state
 from jaxrock.engines.stepper import AbstractEngine, AbstractStepper
 from jaxrock.engines.taylor.careful import Series
-from jaxrock.engines.taylor.follow import follow, most_steps
+from jaxrock.engines.taylor.fast_loop import fast_loop, most_steps
 from jaxrock.engines.taylor.policy import POLICY
 from jaxrock.flexible.response import outcome_flexible
 from jaxrock.flexible.stepper import FlexibleOutcome
@@ -23,14 +26,9 @@ from jaxrock.models.equation import AbstractEquation
 from jaxrock.motions.joined_records import is_in_place
 from jaxrock.motions.motion import AbstractMotion
 from jaxrock.motions.record import padded
-from jaxrock.numerics.choice import where
 from jaxrock.responses.arguments import USUAL, AnyBlock, RigidBlock, engine_of, start_of, steps_of_flexible
 from jaxrock.responses.current_model import current_model, standing
-from jaxrock.status import Status, marked_result, still_if_none
-from jaxrock.transforms.differentiation import differentiable
-from jaxrock.transforms.recipe import Passes
-
-Scalar = Inexact[Array, "..."]
+from jaxrock.status import Status, still_if_none
 
 
 class Outcome(AbstractTable):
@@ -70,15 +68,15 @@ class Outcome(AbstractTable):
     through zero can be narrower than the last digit.
     """
 
-    max_rotation: Scalar
-    max_velocity: Scalar
-    time_of_max: Scalar
+    max_rotation: Real
+    max_velocity: Real
+    time_of_max: Real
     impact_count: Int[Array, "..."]
     overturned: Bool[Array, "..."]
-    margin: Scalar
+    margin: Real
     differentiable: Bool[Array, "..."]
-    clearance: Scalar
-    error: Scalar
+    clearance: Real
+    error: Real
     status: Status
 
     @property
@@ -157,7 +155,7 @@ def outcome(
     in_place = isinstance(engine, Series) and is_in_place(motion)
     given = block, motion if in_place else padded(motion), model, start
     result = _outcome(*(given if throw else still_if_none(given)), engine)
-    return result if throw else marked_result(result, given)
+    return result if throw else checks.nan_where_inputs_are(result, given)
 
 
 @jax.jit
@@ -167,9 +165,11 @@ def _outcome(block, motion, model, initial, engine) -> Outcome:
         return _by_steps(scene)
     check_single(block=block, motion=motion)
     if not isinstance(engine, Series):
-        return differentiable(_by_steps, _on_tape, None, "outcome", outcome_like, in_lanes=True, refilled=True)(scene)
-    passes = _passes(POLICY.is_record(motion.knots.size - 1))
-    return differentiable(passes.whole, _on_tape, passes, "outcome", outcome_like)(scene)
+        return lane_function(
+            _by_steps, reverse=_on_tape, key="outcome", results=outcome_like, in_lanes=True, refill=True
+        )(scene)
+    passes = _OutcomePasses(rounds=POLICY.is_record(motion.knots.size - 1))
+    return lane_function(passes, reverse=_on_tape, key="outcome", results=outcome_like)(scene)
 
 
 def _by_steps(scene) -> Outcome:
@@ -191,28 +191,31 @@ def outcome_like(scene) -> Outcome:
     return jax.eval_shape(made)
 
 
-def _passes(rounds: bool) -> Passes:
-    """Return the outcome in parts, with rounds where some blocks are lost long before others."""
+class _OutcomePasses(TwoPass):
+    """The outcome in two passes, with rounds where some blocks are lost long before others."""
 
-    def begin(scene):
-        block, motion, model, initial, engine = scene
+    def __init__(self, rounds: bool):
+        self.round = POLICY.round if rounds else None
+
+    def init(self, tree):
+        block, motion, model, initial, engine = tree
         scene = Scene.of(block, motion, model, in_place=True)
         stepper = engine.stepper(scene, None, history=False)
         state = initial_state(scene, *(jnp.asarray(x, scene.p.dtype) for x in initial))
         return stepper, all_moving(state, scene)
 
-    def result_of(stepper, state):
-        result = conclude(stepper, state)
-        return result, result.status != Status.successful
+    def fast(self, point, state, limit):
+        return fast_loop(point, state, limit)
 
-    return Passes(
-        begin=begin,
-        quickly=follow,
-        carefully=lambda stepper, state: stepper.to_the_end(state),
-        unfinished=lambda stepper, state: ~state.done & (state.steps < most_steps(stepper.scene.most_pieces)),
-        conclude=result_of,
-        round=POLICY.round if rounds else None,
-    )
+    def accurate(self, point, state):
+        return point.to_the_end(state)
+
+    def unfinished(self, point, state):
+        return ~state.done & (state.steps < most_steps(point.scene.most_pieces))
+
+    def result(self, point, state):
+        result = conclude(point, state)
+        return result, result.status != Status.successful
 
 
 def _to_outcome(block, motion, model, initial, engine, *, taped: bool) -> Outcome:
@@ -222,7 +225,7 @@ def _to_outcome(block, motion, model, initial, engine, *, taped: bool) -> Outcom
     return conclude(stepper, stepper.end_on_tape(state) if taped else stepper.to_the_end(all_moving(state, scene)))
 
 
-def has_one_peak(peak: Scalar, second: Scalar, clearance: Scalar, alpha: Scalar) -> Bool[Array, "..."]:
+def has_one_peak(peak: Real, second: Real, clearance: Real, alpha: Real) -> Bool[Array, "..."]:
     """Return whether neither another peak ties with the highest, nor an impact is grazed before it."""
     equal = max(1e-9, ROUNDING * float(jnp.finfo(peak.dtype).eps))
     tie = (peak - second <= equal * peak) & (peak > 0)
@@ -235,17 +238,17 @@ def conclude(stepper: AbstractStepper, state: State) -> Outcome:
     overturned = final.overturned
 
     def unless_overturned(value):
-        return where(overturned, jnp.inf, value)
+        return select(overturned, jnp.inf, value)
 
     # A block that stands still in balance goes nowhere, however many steps it takes.
     eps = jnp.finfo(state.closeness.dtype).eps
     unfinished = Status.where(state.closeness > eps, Status.step_budget_exhausted, Status.undecided)
     is_smooth = has_one_peak(final.peak, final.second, final.peak_clearance, stepper.scene.alpha)
-    margin = where(overturned, -final.closeness_beyond, final.closeness)
+    margin = select(overturned, -final.closeness_beyond, final.closeness)
     status = Status.where(state.done, final.status, unfinished)
     return Outcome(
         differentiable=is_smooth & ~overturned,
-        clearance=where(overturned, final.clearance, final.peak_clearance),
+        clearance=select(overturned, final.clearance, final.peak_clearance),
         max_rotation=unless_overturned(final.peak),
         max_velocity=unless_overturned(final.fastest * stepper.scene.p),
         time_of_max=unless_overturned(final.peak_time),

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Inexact
 
-from jaxrock._checks import is_traced
+from jaxrock._core.arrays import is_traced
 from jaxrock.blocks.asymmetric import AsymmetricBlock
 from jaxrock.blocks.restitution import Reset, on_sides, tells_sides
 from jaxrock.blocks.rigid import Block

@@ -10,37 +10,36 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Inexact, Int
+from jaxtyping import Array, Bool, Int
 
-from jaxrock._described import described
+from jaxrock._arguments.repr import described
+from jaxrock._core.types import Real
+from jaxrock.compiler import lane_function
+from jaxrock.compiler.hints import stop_gradient
 from jaxrock.engines.scene import Scene
 from jaxrock.engines.state import Kept, State, initial_state, surpasses
 from jaxrock.engines.trajectory import rows_of, states_of
-from jaxrock.numerics.fixed import fixed
+from jaxrock.responses.compile_setup import compile_setup, numbers_of
 from jaxrock.responses.outcome import conclude, outcome_like
 from jaxrock.status import Status
-from jaxrock.transforms.differentiation import differentiable
-from jaxrock.transforms.preparation import numbers_of, prepared
-
-Scalar = Inexact[Array, "..."]
 
 
 class Summary(eqx.Module):
     """Summary of a history as a whole (see `Response`)."""
 
     impact_count: Int[Array, "..."]
-    max_rotation: Scalar
-    max_velocity: Scalar
-    time_of_max: Scalar
+    max_rotation: Real
+    max_velocity: Real
+    time_of_max: Real
     overturned: Bool[Array, "..."]
-    margin: Scalar
+    margin: Real
     status: Status
 
     __repr__ = described
 
 
 def history_like(told) -> tuple:
-    """Return the shapes and dtypes of the results of `followed`."""
+    """Return the shapes and dtypes of the results of `steps_followed`."""
     *_, engine = told
 
     def made(*told):
@@ -53,27 +52,25 @@ def history_like(told) -> tuple:
     return steps, nodes, _summary_like(told), numbers
 
 
-def followed(told) -> tuple[Int[Array, ""], Kept, Summary, list]:
+def steps_followed(told) -> tuple[Int[Array, ""], Kept, Summary, list]:
     """Follow a block, and return the number of steps, the kept states before all of them and after the last, the
     summary, and the numbers of the stepper.
 
     The numbers come without their derivatives: XLA need not compute these again.
     """
     engine, end = told[-1], _summary
-    stepper, state = prepared(started, told) if engine.in_lanes else started(told)
+    stepper, state = compile_setup(started, told) if engine.in_lanes else started(told)
     state, nodes = states_of(stepper, state, engine.budget(stepper.scene, history=True), keep=Kept.of)
     if engine.in_lanes:
-        end = differentiable(
-            _summary, None, None, "summary", _summary_like, in_lanes=True, derivatives="in a direction"
-        )
-    return state.steps, nodes, end((stepper, state)), fixed(numbers_of(stepper))
+        end = lane_function(_summary, key="summary", results=_summary_like, in_lanes=True, mode="jvp")
+    return state.steps, nodes, end((stepper, state)), stop_gradient(numbers_of(stepper))
 
 
-def on_tape(told) -> tuple[Int[Array, ""], Kept, Summary, list]:
-    """Return the results of `followed`, computed so that reverse mode differentiates the steps."""
+def steps_on_tape(told) -> tuple[Int[Array, ""], Kept, Summary, list]:
+    """Return the results of `steps_followed`, computed so that reverse mode differentiates the steps."""
     stepper, state = started(told, taped=True)
     state, nodes = stepper.on_tape(state, stepper.engine.budget(stepper.scene, history=True))
-    return state.steps, Kept.of(nodes), _summary((stepper, state)), fixed(numbers_of(stepper))
+    return state.steps, Kept.of(nodes), _summary((stepper, state)), stop_gradient(numbers_of(stepper))
 
 
 def started(told, taped: bool = False) -> tuple[Any, State]:

@@ -3,7 +3,7 @@
 Imports `responses` and `sweeps`. Start with `spectra`.
 """
 
-from jaxrock._surface import shown as _shown
+from jaxrock._core.namespace import shown as _shown
 from jaxrock.studies.azimuths import (
     AzimuthOutcomes as AzimuthOutcomes,
     azimuth_outcomes as azimuth_outcomes,

@@ -11,12 +11,13 @@ import jax
 import numpy as np
 from jaxtyping import ArrayLike, Float, Int8
 
-from jaxrock._arguments import arguments
-from jaxrock._checks import Values, direction, placed, scalar, shown
-from jaxrock._parameters import check_single, shared
-from jaxrock._precision import frames_of_the_package
-from jaxrock._progress import Progress
-from jaxrock._tables import AbstractTable, Column
+from jaxrock._arguments.annotations import arguments
+from jaxrock._arguments.parameters import check_single, shared
+from jaxrock._arguments.ranges import direction, scalar
+from jaxrock._arguments.tables import AbstractTable, Column
+from jaxrock._core.arrays import Values, shown, to_device
+from jaxrock._core.precision import frames_of_the_package
+from jaxrock._core.progress import Progress
 from jaxrock.blocks.asymmetric import AsymmetricBlock
 from jaxrock.blocks.rigid import Block
 from jaxrock.blocks.rock import Rock
@@ -112,7 +113,7 @@ def azimuth_outcomes(
     for index, angle in enumerate(angles):
         motion = components.in_plane(angle - first, vertical)
         lanes = jax.tree.map(lambda x, own, at=index: x[at] if own else np.full(scales.shape, x[at]), known, alike)
-        found.append(of_motion(with_room(motion), placed(lanes), placed(scales), model, engine))
+        found.append(of_motion(with_room(motion), to_device(lanes), to_device(scales), model, engine))
         bar.add(scales.size)
     parts = (np.stack([np.asarray(x) for x in part]) for part in zip(*found))
     return AzimuthOutcomes(angles, scales, blocks, *parts)

@@ -16,12 +16,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxrock._arguments import arguments
-from jaxrock._checks import is_traced
+from jaxrock._arguments.annotations import arguments
+from jaxrock._core.arrays import is_traced
 from jaxrock.status import Status
 from jaxrock.studies.ends import brackets_of, roots_of
 from jaxrock.studies.spectra import OverturningMap, under_pulse
-from jaxrock.sweeps.runner import light
+from jaxrock.sweeps.runner import cheap_per_point
 from jaxrock.sweeps.sweep import surface
 
 _FIRST = 256  # intervals of the first sampling of a column
@@ -240,7 +240,7 @@ def _parts(row: tuple, cuts: dict[tuple, float]) -> list[_Interval]:
     return [_Interval(math.exp(low), cut, first, (first, -1)), _Interval(cut, math.exp(high), last, (-1, last))]
 
 
-@light
+@cheap_per_point
 def _point(z, ratio, scene):
     """Margin, its slope by z and impacts of a block under a pulse of intensity e^z."""
 

@@ -17,13 +17,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from jaxrock._arguments import arguments, at_least, pair
-from jaxrock._checks import if_traced, is_traced, of_each, one_program, placed, ratio, scalar, watched
-from jaxrock._parameters import broadcast, in_real_numbers, leaves_of, one_of_many
-from jaxrock._quickly import quickly
-from jaxrock._tables import AbstractTable, Column
+from jaxrock._arguments.annotations import arguments, at_least, pair
+from jaxrock._arguments.parameters import broadcast, in_real_numbers, leaves_of, one_of_many
+from jaxrock._arguments.ranges import ratio, scalar
+from jaxrock._arguments.tables import AbstractTable, Column
+from jaxrock._core.arrays import if_traced, is_traced, of_each, to_device
+from jaxrock._core.one_program import one_program
 from jaxrock.blocks.asymmetric import AsymmetricBlock
 from jaxrock.blocks.rigid import Block
+from jaxrock.compiler import checks
+from jaxrock.compiler.hints import jit_low_effort
 from jaxrock.engines.scene import uplift_threshold
 from jaxrock.engines.stepper import AbstractEngine
 from jaxrock.models.equation import AbstractEquation
@@ -33,8 +36,8 @@ from jaxrock.responses.current_model import current_model
 from jaxrock.studies.ends import brackets_of, roots_of
 from jaxrock.studies.lowest_ends import lowest_ends
 from jaxrock.studies.parameters import named, peak_of
-from jaxrock.studies.varied import AbstractVaried, Amplitude, Duration, check_sizeless, on_border
-from jaxrock.sweeps.runner import light
+from jaxrock.studies.search_axis import AbstractVaried, Amplitude, Duration, check_sizeless, on_border
+from jaxrock.sweeps.runner import cheap_per_point
 from jaxrock.sweeps.sweep import known_surface, surface
 
 _FIRST = 256  # intervals of the first sampling
@@ -200,13 +203,13 @@ class _Scenes(eqx.Module):
         threshold, peak, amplitude, least = _facts(both, model, size)
         message = "Argument `motion` must move the ground"
         if is_traced(peak):
-            least = watched(least, message, (peak <= _LEAST).any())
+            least = checks.error_if(least, (peak <= _LEAST).any(), message)
         elif (np.asarray(peak) <= _LEAST).any():
             raise ValueError(f"{message}, but its peak is {np.nanmin(np.asarray(peak)):g} g.")
         return cls(both, threshold, amplitude, least, single=not shape)
 
 
-@quickly(eqx.filter_jit)
+@jit_low_effort(eqx.filter_jit)
 def _facts(both: PyTree, model: AbstractEquation, size: int) -> tuple[Array, Array, Array, Array]:
     """Threshold, peak and amplitude of `size` scenes, and the log of the least factor that moves the block."""
 
@@ -228,13 +231,13 @@ def _names(both: PyTree) -> list[str]:
 # Functions of one point of one of many scenes.
 
 
-@light
+@cheap_per_point
 def _at(z, index, scene):
     kind, both = scene
     return kind.at(z, *one_of_many(both, index))
 
 
-@light
+@cheap_per_point
 def _slopes(z, index, scene):
     kind, both = scene
     return kind.slopes(z, *one_of_many(both, index))
@@ -263,7 +266,7 @@ def _critical(
         else _lowest(scenes, grid, kind, wanted, most, progress)
     )
     if not wanted:
-        rows["derivative"] = placed(np.full((*rows["value"].shape, len(names)), np.nan, rows["value"].dtype))
+        rows["derivative"] = to_device(np.full((*rows["value"].shape, len(names)), np.nan, rows["value"].dtype))
     return Critical(**(of_each(lambda x: x[0], rows) if scenes.single else rows), names=names)
 
 
@@ -306,7 +309,7 @@ def _all(scenes: _Scenes, grid, kind: AbstractVaried, names: tuple[str, ...], pr
         table[ends["index"], place] = values
         return table
 
-    return placed({name: filled(name, values) for name, values in rows.items()} | told | {"count": count})
+    return to_device({name: filled(name, values) for name, values in rows.items()} | told | {"count": count})
 
 
 class _Wanted(eqx.Module):
@@ -324,7 +327,7 @@ def _lowest(scenes: _Scenes, grid, kind: AbstractVaried, names: tuple[str, ...],
     return surface(_lowest_of_one, (jnp.arange(grid.shape[0]),), scene, "critical", progress)
 
 
-@quickly(follows_scenes=True)
+@jit_low_effort(follows_scenes=True)
 def _lowest_of_one(index, scene) -> dict:
     """Find ends without derivatives, then attach those of the implicit function."""
     wanted, kind, scenes, grid = scene

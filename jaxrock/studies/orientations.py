@@ -15,7 +15,8 @@ from collections.abc import Iterable
 from numbers import Real
 from typing import Any, NamedTuple
 
-from jaxrock._checks import one_of, shown
+from jaxrock._arguments.ranges import one_of
+from jaxrock._core.arrays import shown
 
 __all__ = ["ORIENTATIONS", "QUANTITIES", "Quantity", "combined", "of_series", "power", "product"]
 

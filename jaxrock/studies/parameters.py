@@ -6,22 +6,18 @@ from collections import Counter
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Inexact
 
-from jaxrock._checks import not_negative, share
-from jaxrock._guard import as_array
-from jaxrock._parameters import Leaf, Parameter, declared, is_ours, leaves_of, with_values
+from jaxrock._arguments.parameters import Leaf, Parameter, declared, is_ours, leaves_of, with_values
+from jaxrock._arguments.ranges import not_negative, share
+from jaxrock._core.arrays import as_array
+from jaxrock._core.types import Real
 from jaxrock.blocks.asymmetric import AsymmetricBlock
-from jaxrock.blocks.flexible import FlexibleBlock
 from jaxrock.blocks.restitution import Constant, PerSide, tells_sides
-from jaxrock.blocks.rigid import Block
 from jaxrock.engines.scene import peak_bound
 from jaxrock.motions.motion import AbstractMotion, Scaled, Shifted, Summed
 from jaxrock.motions.peaks import peaks_of_motion
 from jaxrock.motions.pulses.mavroeidis_papageorgiou import MavroeidisPapageorgiouPulse
-
-Real = Inexact[Array, "..."]
-AnyBlock = Block | AsymmetricBlock | FlexibleBlock
+from jaxrock.responses.arguments import AnyBlock
 
 
 def named(block: AnyBlock, motion: AbstractMotion) -> dict[str, Real]:
@@ -127,11 +123,11 @@ def _rebuilt_motion(motion: AbstractMotion, values: dict[str, Real], amplitude: 
     changed = with_values(motion, {name: values[name] for name in names})
     if "amplitude" not in names:
         peak = jax.lax.stop_gradient(peak_of(motion) if amplitude is None else amplitude)
-        changed = scaled(changed, values["amplitude"] / jnp.where(peak == 0, 1.0, peak))  # rest scales to rest
+        changed = scaled_motion(changed, values["amplitude"] / jnp.where(peak == 0, 1.0, peak))  # rest scales to rest
     return changed
 
 
-def scaled(motion: AbstractMotion, factor: Real) -> AbstractMotion:
+def scaled_motion(motion: AbstractMotion, factor: Real) -> AbstractMotion:
     """Return a motion times a factor, unchecked: a NaN factor makes the outcome of the scene NaN."""
     return eqx.tree_at(lambda changed: changed.factor, Scaled(motion, jnp.ones_like(factor)), factor)
 

@@ -5,14 +5,16 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float, Inexact
 
-from jaxrock._arguments import arguments
-from jaxrock._checks import Values, as_real, not_nan, scalar
-from jaxrock._described import described
-from jaxrock._parameters import check_single, in_real_numbers
-from jaxrock._quickly import quickly
-from jaxrock._tables import AbstractTable, Column, scenes
+from jaxrock._arguments.annotations import arguments
+from jaxrock._arguments.parameters import check_single, in_real_numbers
+from jaxrock._arguments.ranges import not_nan, scalar
+from jaxrock._arguments.repr import described
+from jaxrock._arguments.tables import AbstractTable, Column, scenes
+from jaxrock._core.arrays import Values, as_real
+from jaxrock._core.types import Real
 from jaxrock.blocks.asymmetric import AsymmetricBlock
 from jaxrock.blocks.rigid import Block
+from jaxrock.compiler.hints import jit_low_effort
 from jaxrock.engines.scene import uplift_threshold
 from jaxrock.engines.stepper import AbstractEngine
 from jaxrock.models.equation import AbstractEquation
@@ -24,10 +26,8 @@ from jaxrock.responses.outcome import Outcome, outcome
 from jaxrock.status import Enumeration, Status, item
 from jaxrock.studies.parameters import named, rebuilt
 from jaxrock.studies.spectra import axis, scaled_law
-from jaxrock.sweeps.runner import light
+from jaxrock.sweeps.runner import cheap_per_point
 from jaxrock.sweeps.sweep import surface
-
-Scalar = Inexact[Array, "..."]
 
 
 class SlopeStatus(Enumeration):
@@ -58,10 +58,10 @@ class Slopes(eqx.Module):
 
     __repr__ = described
 
-    value: Scalar
+    value: Real
     derivative: Inexact[Array, "... parameters"]
     elasticity: Inexact[Array, "... parameters"]
-    reach: Scalar
+    reach: Real
     status: SlopeStatus
 
 
@@ -87,9 +87,9 @@ class Sensitivity(AbstractTable):
     margin: Slopes
     outcome: Outcome
     valid: Bool[Array, "..."]
-    condition: Scalar
-    graze_distance: Scalar
-    boundary_distance: Scalar
+    condition: Real
+    graze_distance: Real
+    boundary_distance: Real
 
     @property
     def _columns(self):
@@ -142,7 +142,7 @@ def sensitivity(
     return _sensitivity(block, motion, current_model(model, block, motion), engine)
 
 
-@quickly(follows_scenes=True)  # one program, because it has many operations
+@jit_low_effort(follows_scenes=True)  # one program, because it has many operations
 def _sensitivity(block, motion, model, engine) -> Sensitivity:
     parameters = named(block, motion)
     names, values = tuple(parameters), jnp.stack([jnp.asarray(v) for v in parameters.values()])
@@ -261,7 +261,7 @@ def sensitivity_map(
     return SensitivityMap(strength, duration, shape, sensitivities)
 
 
-@light
+@cheap_per_point
 def _under_lobe(strength, duration, scene) -> Sensitivity:
     shape, alpha, restitution, model, engine = scene
     block = Block(alpha, jnp.ones_like(alpha), restitution)

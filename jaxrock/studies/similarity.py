@@ -17,12 +17,14 @@ from collections.abc import Callable
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Inexact
+from jaxtyping import ArrayLike
 
-from jaxrock._arguments import arguments
-from jaxrock._checks import as_real, is_traced, not_nan, one_of, positive, share, size
-from jaxrock._described import described
-from jaxrock._parameters import declared
+from jaxrock._arguments.annotations import arguments
+from jaxrock._arguments.parameters import declared
+from jaxrock._arguments.ranges import not_nan, one_of, positive, share, size
+from jaxrock._arguments.repr import described
+from jaxrock._core.arrays import as_real, is_traced
+from jaxrock._core.types import Real
 from jaxrock.blocks.restitution import tells_sides
 from jaxrock.blocks.rigid import Block
 from jaxrock.motions.pulses.pulse import AbstractPulse
@@ -36,8 +38,7 @@ def __dir__() -> list[str]:
     return __all__
 
 
-Real = Inexact[Array, "..."]
-KINDS = ("slender", "rigid")
+_KINDS = ("slender", "rigid")
 
 
 class Groups(eqx.Module):
@@ -121,7 +122,7 @@ def groups(block: Block, amplitude: ArrayLike, frequency: ArrayLike, kind: str =
     """
     amplitude, frequency = size("amplitude", amplitude), size("frequency", frequency)
     _check_law(block)
-    if one_of("kind", kind, KINDS) == "slender":
+    if one_of("kind", kind, _KINDS) == "slender":
         return Groups(frequency / block.p, block.alpha / amplitude, block.restitution)  # 4.11
     return Groups(frequency / block.p, jnp.tan(block.alpha) / amplitude, block.restitution, jnp.cos(block.alpha))  # 5.3
 
@@ -218,7 +219,7 @@ def scales(block: Block, amplitude: ArrayLike | None = None, kind: str = "rigid"
 
     **Source:** Dimitrakopoulos & DeJong (2012), equations 4.10, 4.11 and 6.1.
     """
-    factor = jnp.cos(block.alpha) if one_of("kind", kind, KINDS) == "rigid" else jnp.ones_like(block.alpha)
+    factor = jnp.cos(block.alpha) if one_of("kind", kind, _KINDS) == "rigid" else jnp.ones_like(block.alpha)
     rotation = block.alpha if amplitude is None else size("amplitude", amplitude) * factor
     return Scales(1 / block.p, rotation, block.p * rotation)
 

@@ -11,11 +11,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
-from jaxrock._arguments import arguments
-from jaxrock._checks import Range, Values, not_nan, ratio
-from jaxrock._tables import AbstractTable, Column
+from jaxrock._arguments.annotations import arguments
+from jaxrock._arguments.ranges import Range, not_nan, ratio
+from jaxrock._arguments.tables import AbstractTable, Column
+from jaxrock._core.arrays import Values
 from jaxrock.blocks.restitution import AbstractRestitution, Restitution
 from jaxrock.blocks.rigid import Block
+from jaxrock.compiler import trace_function
 from jaxrock.engines.stepper import AbstractEngine
 from jaxrock.models.equation import AbstractEquation
 from jaxrock.models.rigid import Housner
@@ -24,9 +26,8 @@ from jaxrock.motions.pulses.sinusoidal import SinePulse
 from jaxrock.responses.current_model import current_model
 from jaxrock.responses.outcome import Outcome, outcome
 from jaxrock.status import Status
-from jaxrock.sweeps.runner import light
+from jaxrock.sweeps.runner import cheap_per_point
 from jaxrock.sweeps.sweep import surface
-from jaxrock.transforms.user_function import ByIdentity, UserFunction, current_function
 
 
 class Spectrum(AbstractTable):
@@ -270,14 +271,14 @@ def _scene(axes: _PulseAxes, alpha, restitution, pulse, model, engine) -> tuple:
     block, lists = of_any_size(alpha, restitution), tuple(axes.lists)
     numbers = {name: value for name, value in axes.parameters.items() if name not in lists}
     number = jax.ShapeDtypeStruct((), jnp.result_type(block.alpha, *axes.parameters.values(), *axes[:2]))
-    made = _Family(current_function(pulse, number, number, **dict.fromkeys(axes.parameters, number)), numbers, lists)
+    made = _Family(trace_function(pulse, number, number, **dict.fromkeys(axes.parameters, number)), numbers, lists)
     return block.alpha, scaled_law(block), made, current_model(model, block, axes.ratio, axes.intensity), engine
 
 
 class _Family(eqx.Module):
     """A family of pulses by size and extent: some parameters are fixed numbers, others are given at each point."""
 
-    pulse: UserFunction | ByIdentity
+    pulse: Callable
     numbers: dict[str, Array]
     lists: tuple[str, ...] = eqx.field(static=True)
 
@@ -353,7 +354,7 @@ def _kept(result: Outcome, block: Block) -> dict:
 # compiled again.
 
 
-@light
+@cheap_per_point
 def _under_motion(period, scene):
     alpha, restitution, motion, model, engine = scene
     alpha, period = _in_one_precision(alpha, period, of=motion)
@@ -379,6 +380,6 @@ def _in_one_precision(*numbers: Array, of: Any = ()) -> list[Array]:
     return [x.astype(kind) for x in numbers]
 
 
-@light
+@cheap_per_point
 def _under_pulse(*point_and_scene) -> dict:
     return _kept(*under_pulse(*point_and_scene))

@@ -12,17 +12,18 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import ArrayLike
 
-from jaxrock._checks import Values, placed, shown, size
-from jaxrock._parameters import leaves_of, one_of_many, shared
-from jaxrock._progress import Progress
-from jaxrock._quickly import quickly
+from jaxrock._arguments.parameters import leaves_of, one_of_many, shared
+from jaxrock._arguments.ranges import size
+from jaxrock._core.arrays import Values, shown, to_device
+from jaxrock._core.progress import Progress
 from jaxrock.blocks.asymmetric import AsymmetricBlock
 from jaxrock.blocks.restitution import tells_sides
 from jaxrock.blocks.rigid import Block
+from jaxrock.compiler.hints import jit_low_effort
 from jaxrock.models.equation import AbstractEquation
+from jaxrock.motions.mirrored import scaled_and_mirrored
 from jaxrock.motions.record import with_room
 from jaxrock.motions.suite import Suite
-from jaxrock.motions.turned import felt
 from jaxrock.responses.current_model import current_model
 from jaxrock.responses.outcome import outcome
 from jaxrock.status import Status
@@ -56,7 +57,7 @@ def stacked(block: Block | AsymmetricBlock) -> Block | AsymmetricBlock:
 def _of_each(blocks: Block | AsymmetricBlock, function: Callable[[np.ndarray], np.ndarray]):
     """Apply a function to the array of every number of a block; leaves that all draws share stay."""
     arrays = jax.tree.map(np.asarray, blocks)
-    return jax.tree.map(lambda x, own: placed(x if own else function(x)), arrays, shared(blocks))
+    return jax.tree.map(lambda x, own: to_device(x if own else function(x)), arrays, shared(blocks))
 
 
 def is_symmetric(block: Block | AsymmetricBlock) -> bool:
@@ -98,7 +99,7 @@ def comes_back(verdict: np.ndarray) -> np.ndarray:
     return np.any(np.maximum.accumulate(verdict == TOPPLED, axis=1) & (verdict == STOOD), axis=1)
 
 
-def scenes(
+def scenes_of_suite(
     blocks: Block | AsymmetricBlock, suite: Suite, factors: np.ndarray, model: AbstractEquation, engine, progress
 ) -> Scenes:
     """Compute stacked blocks under every motion of a suite times factors: (motions, factors) or (factors,) for all."""
@@ -110,20 +111,20 @@ def scenes(
     bar = Progress(factors.size * draws, "suite", progress)
     found = []
     for motion, row in zip(suite.motions(), factors):
-        found.append(of_motion(with_room(motion), lanes, placed(np.tile(row, draws)), model, engine))
+        found.append(of_motion(with_room(motion), lanes, to_device(np.tile(row, draws)), model, engine))
         bar.add(count * draws)
     shape = len(suite), draws, count
     parts = (np.stack([np.asarray(x) for x in part]).reshape(shape).swapaxes(1, 2) for part in zip(*found))
     return Scenes(*parts)
 
 
-@quickly(follows_scenes=True)
+@jit_low_effort(follows_scenes=True)
 def of_motion(motion, blocks, factors, model, engine) -> Scenes:
     """Compute all scenes of one motion, side by side: stacked blocks, each with its factor."""
 
     def one(lane, factor):
         block = one_of_many(blocks, lane)
-        result = outcome(block, felt(motion, factor), model, engine=engine)
+        result = outcome(block, scaled_and_mirrored(motion, factor), model, engine=engine)
         alpha = jnp.minimum(block.alpha1, block.alpha2) if isinstance(block, AsymmetricBlock) else block.alpha
         good = result.status == Status.successful
         verdict = jnp.where(good, jnp.where(result.overturned, TOPPLED, STOOD), UNDECIDED).astype(jnp.int8)

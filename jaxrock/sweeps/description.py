@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from jaxrock._aside import written_aside
-from jaxrock._precision import setting
-from jaxrock._regular_files import open_regular
-from jaxrock.keeping.facts import code, version_of
+from jaxrock._core.atomic_files import written_atomically
+from jaxrock._core.precision import setting
+from jaxrock._core.regular_files import open_regular
+from jaxrock.compiler import cache
 from jaxrock.sweeps.labels import RECORDS, layout_name
 
 TWINS = ("zarr.json", f"{RECORDS}/store.json")  # the root of a Zarr group, and a second copy of it
@@ -32,10 +32,10 @@ def fingerprint(
         "layout": layout_name(outer),
         "precision": "double" if setting("jax_enable_x64") else "single",
         "function, or what it holds": program,
-        "version of jaxrock": version_of("jaxrock"),
-        "code of jaxrock": code(),
-        "version of JAX": f"{version_of('jax')}, {version_of('jaxlib')}",
-        "version of llvmlite": version_of("llvmlite"),
+        "version of jaxrock": cache.version_of("jaxrock"),
+        "code of jaxrock": cache.code_digest(),
+        "version of JAX": f"{cache.version_of('jax')}, {cache.version_of('jaxlib')}",
+        "version of llvmlite": cache.version_of("llvmlite"),
     }
 
 
@@ -126,11 +126,11 @@ class Description:
             if _read(file) == said:
                 continue
             file.parent.mkdir(exist_ok=True)
-            with written_aside(file, replace=True) as aside:
+            with written_atomically(file, replace=True) as aside:
                 aside.write_text(json.dumps(said, indent=1), encoding="utf-8")
 
 
-def described(path: Path, wanted: str) -> Description:
+def read_description(path: Path, wanted: str) -> Description:
     """Read the description at a path; `wanted`: the argument and its requirement, in words.
 
     **Raises:** ValueError where there is no store, or one whose description is lost.

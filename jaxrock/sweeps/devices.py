@@ -13,8 +13,8 @@ import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import UInt8
 
-from jaxrock._arguments import arguments, at_least
-from jaxrock._precision import setting
+from jaxrock._arguments.annotations import arguments, at_least
+from jaxrock._core.precision import setting
 
 # Wide vectors and fused multiply-add; NaN, infinity and division keep IEEE semantics. The engine's tests run with them.
 _CPU_OPTIONS = {
@@ -75,7 +75,7 @@ def compiler_options(platform: str) -> dict | None:
     return _CPU_OPTIONS
 
 
-# All processes of a job run the same program, and synchronise where it calls `meet`.
+# All processes of a job run the same program, and synchronise where it calls `barrier`.
 
 
 def process() -> tuple[int, int]:
@@ -106,7 +106,7 @@ def shared_out() -> Iterator[None]:
         _sharing.release()
 
 
-def meet() -> None:
+def barrier() -> None:
     """Wait until all processes have called this function."""
     if jax.process_count() == 1:
         return
@@ -144,7 +144,7 @@ def all_or_none() -> Iterator[None]:
 
 def _heard(said: str) -> list[str]:
     """Exchange a short message with all processes; return all messages."""
-    meet()
+    barrier()
     brought = np.zeros(_SAID, np.uint8)
     told = np.frombuffer(said.encode()[:_SAID], np.uint8)
     brought[: told.size] = told

@@ -10,8 +10,8 @@ import jax
 import numpy as np
 from jaxtyping import Shaped
 
-from jaxrock._aside import uninterrupted, written_aside
-from jaxrock._tables import is_status, items_of, needed
+from jaxrock._arguments.tables import is_status, items_of, needed
+from jaxrock._core.atomic_files import uninterrupted, written_atomically
 from jaxrock.sweeps import netcdf
 from jaxrock.sweeps.description import fingerprint
 from jaxrock.sweeps.labels import POINT, dimensions, layout_name, names_of, numbered, own_names, shape_of
@@ -117,7 +117,7 @@ class Grid(eqx.Module):
             if leaf.dtype.kind not in "biuf" or leaf.dtype == np.float16:
                 raise ValueError(f"NetCDF has no {leaf.dtype}, which {name!r} is: take a path that ends with .zarr.")
         stopped = threading.Event()
-        uninterrupted(netcdf.write, self.to_xarray(), path, stopped, stop=stopped.set)
+        uninterrupted(netcdf.write_dataset, self.to_xarray(), path, stopped, stop=stopped.set)
 
     def _to_zarr(self, path: Path) -> None:
         axes, words = numbered({name: _in_order(np.asarray(values)) for name, values in self.axes.items()})
@@ -127,7 +127,7 @@ class Grid(eqx.Module):
         made_by, stopped = fingerprint(axes, self.outer, "saved results", words), threading.Event()
 
         def written():
-            with written_aside(path) as aside:
+            with written_atomically(path) as aside:
                 store = create(aside, axes, self.outer, like, plan.block, made_by, words, whole=True)
                 for number in range(store.count):
                     if stopped.is_set():
@@ -153,7 +153,7 @@ class Grid(eqx.Module):
         if path.is_dir():
             store = opened(path)
             return cls(store.axes(), _rebuilt(dict(zip(store.names, store.read()))), store.outer)
-        with netcdf.opened(path) as data:
+        with netcdf.opened_dataset(path) as data:
             axes = {str(name): _known(np.asarray(values)) for name, values in data.coords.items()}
             values = {str(name): np.asarray(values) for name, values in data.data_vars.items()}
             return cls(axes, _rebuilt(values), data.attrs["layout"] == layout_name(True))

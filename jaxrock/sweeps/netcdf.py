@@ -8,9 +8,9 @@ import hashlib
 import threading
 from pathlib import Path
 
-from jaxrock._aside import written_aside
-from jaxrock._regular_files import open_regular
-from jaxrock._tables import needed
+from jaxrock._arguments.tables import needed
+from jaxrock._core.atomic_files import written_atomically
+from jaxrock._core.regular_files import open_regular
 
 _MARK = b"\njaxrock sha256 "
 _DIGEST = hashlib.sha256().digest_size
@@ -86,10 +86,10 @@ class _Patient:
         """Do nothing: writes are unbuffered."""
 
 
-def write(dataset, path: Path, stopped: threading.Event) -> None:
+def write_dataset(dataset, path: Path, stopped: threading.Event) -> None:
     """Write an `xarray.Dataset` to a new file, completely or not at all; write nothing if `stopped` is set."""
     h5netcdf, backends = needed("h5netcdf"), needed("xarray.backends")
-    with written_aside(path) as aside, aside.open("w+b", buffering=0) as file:
+    with written_atomically(path) as aside, aside.open("w+b", buffering=0) as file:
         patient = _Patient(file, stopped)
         try:
             with h5netcdf.File(patient, "w") as opened:
@@ -103,7 +103,7 @@ def write(dataset, path: Path, stopped: threading.Event) -> None:
         patient._write(file.seek(0, 2), _MARK + digest)
 
 
-def opened(path: Path):
+def opened_dataset(path: Path):
     """Return the `xarray.Dataset` of an undamaged file.
 
     **Raises:** ValueError for a damaged one.

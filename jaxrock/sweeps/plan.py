@@ -8,19 +8,19 @@ import numpy as np
 
 from jaxrock.sweeps.labels import shape_of
 
-_CHUNK = 64  # neighbours that are dealt to a device together
-_TILE = 8  # and their extent along each of the last two axes of a grid
-# Lanes of a compiled call on a CPU, and the most calls of that size before a larger size is taken. Each size is
-# compiled, which takes longer than these calls.
+_CHUNK = 64  # neighbours that go to one device together
+_TILE = 8  # extent of these neighbours along each of the last two axes of a grid
+# By the number of lanes of a compiled call on a CPU: the most calls of that size. More calls would use the next size:
+# compiling another size takes longer than these calls.
 _CALLS = {_CHUNK: 1, 2 * _CHUNK: 4, 2**10: 8, 2**14: math.inf}
 _GPU_LANES = 2**10, 2**16  # the least and the most, in powers of two
 _SMALLEST_BLOCK = 65536
-_LARGEST_BLOCK = 2**18  # bounds the memory, whatever the size of the grid
-_BLOCKS = 64  # of a large grid: a killed job loses at most one of them per process, and processes share them
+_LARGEST_BLOCK = 2**18  # bounds the memory for grids of any size
+_BLOCKS = 64  # number of blocks of a large grid, which processes share; a killed job loses one per process at most
 
 
 class Plan(NamedTuple):
-    """Grid of points and its blocks: tiles of `block` points along every axis; the last of an axis may be smaller."""
+    """Grid of points and its blocks: tiles of `block` points along each axis; the last of an axis may be smaller."""
 
     axes: tuple[np.ndarray, ...]
     outer: bool
@@ -71,8 +71,8 @@ class Plan(NamedTuple):
 def layout(points: int, devices: int, platform: str) -> tuple[int, int]:
     """Return the shape of a batch, (devices, lanes): one of few shapes, each of which is compiled.
 
-    Few scenes skip the quick pass (`transforms.batching`), which changes last digits. Whether they are few depends on
-    the points, not on the number of devices that share them.
+    Few points skip the fast pass (`compiler.primitive.lanes`), which changes the last digits. The number of points
+    decides it, not the number of devices that share them.
     """
     share = -(-points // devices)
     if platform != "cpu":
@@ -82,8 +82,8 @@ def layout(points: int, devices: int, platform: str) -> tuple[int, int]:
     return devices, next(n for n, calls in _CALLS.items() if share <= n * calls and (few or n > _CHUNK))
 
 
-def deal(points: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
-    """Reorder flat points device by device, dealing chunks in turn: neighbours cost alike, so the shares cost alike."""
+def shard(points: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+    """Reorder flat points by device, with chunks in turn: neighbours cost the same, so the shares do."""
     devices, lanes = shape
     if devices == 1:
         return points
@@ -93,7 +93,7 @@ def deal(points: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
 @functools.lru_cache(maxsize=16)
 def dealt_to(shape: tuple[int, int]) -> list[np.ndarray]:
     """Return the points of a batch that each device has, in its order."""
-    return list(deal(np.arange(math.prod(shape)), shape).reshape(shape))
+    return list(shard(np.arange(math.prod(shape)), shape).reshape(shape))
 
 
 @functools.lru_cache(maxsize=16)

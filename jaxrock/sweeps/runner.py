@@ -10,24 +10,24 @@ import jax
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
-from jaxrock._quickly import MUCH, options as quick_options
+from jaxrock.compiler import checks
+from jaxrock.compiler.hints import LOW_EFFORT_LIMIT, low_effort_options
 from jaxrock.sweeps.devices import compiler_options, local_devices
-from jaxrock.sweeps.plan import deal, dealt_to, layout
-from jaxrock.transforms.fingerprint import Checked, Program, with_checks
+from jaxrock.sweeps.plan import dealt_to, layout, shard
 
 _EVERYWHERE, _DEALT = PartitionSpec(), PartitionSpec("devices")
-# A function marked `light` is compiled briefly for at most `_FEW` points, and at most `_LITTLE` points times numbers of
-# its scene: these take less time than a thorough compilation (`benchmarks/fits.md`).
+# A function marked `cheap_per_point` is compiled briefly for at most `_FEW` points, and at most `_LITTLE` points times
+# numbers of its scene: these take less time than a thorough compilation (`benchmarks/fits.md`).
 _FEW, _LITTLE = 2**14, 2_000_000
-_LIGHT = "_follows_one_rigid_block"
+_CHEAP = "_follows_one_rigid_block"
 
 
-def light(function: Callable) -> Callable:
+def cheap_per_point(function: Callable) -> Callable:
     """Mark a function of a point that follows one rigid block.
 
     Where it gets no machine code of its own, XLA compiles it for as long as thousands of points take.
     """
-    setattr(function, _LIGHT, True)
+    setattr(function, _CHEAP, True)
     return function
 
 
@@ -46,9 +46,9 @@ class Runner:
         self._scene = structure.unflatten(leaves)
         kinds, like = tuple(x.dtype for x in axes), tuple(map(jax.typeof, leaves))
         in_all = in_all or points
-        brief = hasattr(function, _LIGHT) and in_all <= _FEW and in_all * sum(x.size for x in like) <= _LITTLE
+        brief = hasattr(function, _CHEAP) and in_all <= _FEW and in_all * sum(x.size for x in like) <= _LITTLE
         self._call, self._messages, self.tree, self.shapes = _compiled(
-            function, self._mesh, self._layout, kinds, structure, like, in_all <= MUCH, brief
+            function, self._mesh, self._layout, kinds, structure, like, in_all <= LOW_EFFORT_LIMIT, brief
         )
 
     def __call__(
@@ -109,7 +109,7 @@ class Runner:
             parts = [x[numbers] for x in points]
             if numbers.size < batch:
                 parts = [np.concatenate([x, np.repeat(x[-1:], batch - numbers.size)]) for x in parts]
-            dealt = [deal(x, self._layout) for x in parts]
+            dealt = [shard(x, self._layout) for x in parts]
             if self._mesh.size > 1:
                 dealt = jax.device_put(dealt, NamedSharding(self._mesh, _DEALT))
             results = self._call(dealt, self._scene)
@@ -133,8 +133,8 @@ class _Compiled(NamedTuple):
     shapes: list[jax.ShapeDtypeStruct]
 
 
-# The cache key is a `Program`, identified by its text, or a function of the package, which exists once. User input
-# lies in the scene, a pytree, by whose structure `jax.jit` tells programs apart.
+# `function` is one of the package, which exists once. User input lies in the scene, a pytree: a user's function is one,
+# too, and its jaxpr is a part of the structure by which `jax.jit` tells programs apart.
 @functools.lru_cache(maxsize=64)
 def _compiled(
     function: Callable,
@@ -171,24 +171,19 @@ class _AtFirst:
             lowered = self._function.lower(*batch)
             # Without loops, scenes are machine code of their own, and the program around them is compiled quickly.
             quick = self._platform == "cpu" and (self._brief or "stablehlo.while" not in lowered.as_text())
-            self._compiled = lowered.compile(quick_options() if quick else compiler_options(self._platform))
+            self._compiled = lowered.compile(low_effort_options() if quick else compiler_options(self._platform))
         return self._compiled(*batch)
 
 
 @functools.lru_cache(maxsize=32)
 def _call_of(function: Callable, mesh: Mesh, at_first: bool) -> Callable:
-    """Return `function(*point, scene)` over points dealt to devices, with `Checked` results.
+    """Return `function(*point, scene)` over points dealt to devices, with their checks.
 
     XLA's options are set here, or at compilation if `at_first`.
     """
 
     def on_one(points, scene):
-        def one(*point):
-            if isinstance(function, Program):
-                return Checked(*function(*point, scene), function.messages)
-            return with_checks(function)(*point, scene)
-
-        return jax.vmap(one)(*points)
+        return jax.vmap(lambda *point: checks.with_checks(function)(*point, scene))(*points)
 
     options = None if at_first else compiler_options(mesh.devices.flat[0].platform)
     if mesh.size == 1:

@@ -17,9 +17,9 @@ from typing import Any
 import jax
 import numpy as np
 
-from jaxrock._aside import uninterrupted, written_aside
-from jaxrock._tables import needed
-from jaxrock.sweeps.description import Description, described, digest_of_axis
+from jaxrock._arguments.tables import needed
+from jaxrock._core.atomic_files import uninterrupted, written_atomically
+from jaxrock.sweeps.description import Description, digest_of_axis, read_description
 from jaxrock.sweeps.labels import POINT, RECORDS, dimensions, layout_name, shape_of
 from jaxrock.sweeps.plan import Plan
 from jaxrock.sweeps.stored import stored
@@ -222,7 +222,7 @@ def opened(path: Path) -> Store:
 
     **Raises:** ValueError where there is none, or one whose files differ from its description.
     """
-    description = described(path, "Argument `path` must be the store of a sweep or a saved grid")
+    description = read_description(path, "Argument `path` must be the store of a sweep or a saved grid")
     _refuse(path, description.damaged(path))
     return Store(path, description)
 
@@ -232,7 +232,7 @@ def of_sweep(path: Path, made_by: dict[str, str]) -> Store:
 
     **Raises:** ValueError for a store of another sweep, or anything else at this path.
     """
-    description = described(path, "Argument `store` must be a new path or the store of a sweep")
+    description = read_description(path, "Argument `store` must be a new path or the store of a sweep")
     known = description.about["made_by"]
     parts = [part for part in {**known, **made_by} if known.get(part) != made_by.get(part)]
     if parts:
@@ -260,7 +260,7 @@ def _made_or_mended(path, axes, outer, leaves, block, made_by, words) -> list[Pa
     if not path.exists():
         path.parent.mkdir(parents=True, exist_ok=True)
         try:
-            with written_aside(path) as aside:
+            with written_atomically(path) as aside:
                 create(aside, axes, outer, leaves, block, made_by, words)
             return []
         except FileExistsError:  # another process made it first

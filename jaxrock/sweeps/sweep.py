@@ -21,13 +21,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import ArrayLike
 
-from jaxrock._arguments import arguments, at_least
-from jaxrock._aside import uninterrupted
-from jaxrock._checks import check_unmasked, is_traced, native, placed, shown
-from jaxrock._named import AbstractNamed
-from jaxrock._precision import frames_of_the_package
-from jaxrock._progress import Progress
-from jaxrock._tables import needed
+from jaxrock._arguments.annotations import arguments, at_least
+from jaxrock._arguments.tables import needed
+from jaxrock._core.arrays import check_unmasked, in_native_bytes, is_traced, shown, to_device
+from jaxrock._core.atomic_files import uninterrupted
+from jaxrock._core.named import AbstractNamed
+from jaxrock._core.precision import frames_of_the_package
+from jaxrock._core.progress import Progress
+from jaxrock.compiler import trace_function
 from jaxrock.sweeps.description import fingerprint
 from jaxrock.sweeps.devices import all_or_none, exchange, process, shared_out
 from jaxrock.sweeps.grid import Grid
@@ -35,7 +36,6 @@ from jaxrock.sweeps.labels import own_names
 from jaxrock.sweeps.plan import Plan, tiles
 from jaxrock.sweeps.runner import Runner
 from jaxrock.sweeps.store import Store, listed, local, made_or_mended, of_sweep
-from jaxrock.transforms.fingerprint import Traced
 
 
 @overload
@@ -121,27 +121,37 @@ def sweep(
         sizes = ", ".join(f"{name} has {values.size}" for name, values in lists.items())
         raise ValueError(f"Axes that go side by side must have one length, but {sizes}.")
 
-    def of_suites(**point):
-        return function(**{name: suites[name][x] if name in suites else x for name, x in point.items()})
+    order = tuple(axes)
 
-    at_point = of_suites if suites else function
-    traced = Traced.of(at_point, {name: jax.ShapeDtypeStruct((), values.dtype) for name, values in lists.items()})
-    names = own_names(list(axes), outer, traced.shapes, 0)
+    def at_point(*point):
+        return function(**dict(zip(order, point)))
+
+    def at_suites(*point):
+        return at_point(*(suites[name][x] if name in suites else x for name, x in zip(order, point)))
+
+    like = [jax.ShapeDtypeStruct((), values.dtype) for values in lists.values()]
+    traced: Any = trace_function(at_suites if suites else at_point, *like)
+    names = own_names(list(axes), outer, traced.results, 0)
     plan = Plan.of(tuple(lists.values()), outer, block)
     with shared_out():
         keeper = None
         if path is not None:
-            if version is None and traced.program.calls_back:
+            if version is None and traced.calls_back:
                 raise ValueError(
                     "Argument `version` must be given for a function that calls back to Python: a store cannot tell "
                     "whether what it calls has changed."
                 )
-            leaves = dict(zip(names, jax.tree.leaves(traced.shapes)))
+            leaves = dict(zip(names, jax.tree.leaves(traced.results)))
             keeper = _keeper(path, plan, lists, words, leaves, traced.fingerprint, version)
             plan = plan._replace(block=keeper.block)
-        values, resumed = compute(traced.program, plan, traced.constants, "sweep", progress, store=keeper, load=load)
+        values, resumed = compute(_at_point, plan, traced, "sweep", progress, store=keeper, load=load)
     labels = {name: np.array(words[name]) if name in words else values for name, values in lists.items()}
     return Grid(labels, values, outer, resumed) if load else None
+
+
+def _at_point(*point_and_traced):
+    *point, traced = point_and_traced
+    return traced(*point)
 
 
 def _keeper(
@@ -210,7 +220,7 @@ def _axis(name: str, values: ArrayLike | Sequence) -> np.ndarray:
             f"{array.dtype}."
         )
     with np.errstate(over="ignore", under="ignore"):
-        found = native(array)
+        found = in_native_bytes(array)
         found = found.astype(jax.dtypes.canonicalize_dtype(found.dtype))  # in the precision of the session
     if array.dtype.kind in "iu" and (found != array).any():
         raise ValueError(
@@ -260,7 +270,7 @@ def surface(
     else:
         results = known_surface(function, axes, scene, label, progress, outer, columns)
     wanted = results if names is None else {name: results[name] for name in names}
-    return wanted if traced else placed(wanted)
+    return wanted if traced else to_device(wanted)
 
 
 def known_surface(

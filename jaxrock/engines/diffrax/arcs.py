@@ -1,14 +1,12 @@
 """The diffrax engine: one `diffrax.diffeqsolve` for each smooth arc of a rocking block.
 
 An arc ends with an impact, turning point, velocity extremum, saddle crossing, certain loss, an angle at which the
-moments bend, or a knot. All events are roots of one function, the smallest of a few guards that start positive.
+moments bend, or a knot. All events are roots of the smallest of a few guards that start positive.
 
 A guard may start at zero, as the opening angle after an impact and the velocity after a turning point do. Division by
 the power of time with which it leaves zero finds a hop of any size. Velocity and acceleration are guarded, too: a dip
-through the ground inside one step cannot hide, because it needs a turning point.
-
-Knots and bends end arcs, so that the right-hand side of every solve is smooth. A step across a jump of its derivative
-keeps values within the tolerance, but not slopes.
+through the ground inside one step cannot hide, because it needs a turning point. A step across a knot or a bend would
+keep values within the tolerance, but not slopes.
 """
 
 from collections.abc import Callable
@@ -20,16 +18,20 @@ import equinox as eqx
 import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Inexact, Int, PyTree
+from jaxtyping import Array, Int, PyTree
 
-from jaxrock._arguments import arguments, at_least, known
-from jaxrock._checks import inner_share
-from jaxrock.engines.bookkeeping import checked, errors_after, escaped, note
+from jaxrock._arguments.annotations import arguments, at_least, known
+from jaxrock._arguments.ranges import inner_share
+from jaxrock._core.types import Flag, Scalar
+from jaxrock.compiler import lane_function
+from jaxrock.engines.bookkeeping import checked_step, errors_after, escaped, record_extrema
+from jaxrock.engines.diffrax.cond_select import cond_select
 from jaxrock.engines.diffrax.guards import (
-    POLICY,
-    Arc,
+    DIFFRAX_POLICY,
+    ArcProblem,
     Forcing,
     Illinois,
+    Pair,
     StepControl,
     field,
     field_of_trials,
@@ -38,6 +40,7 @@ from jaxrock.engines.diffrax.guards import (
     is_hop,
     usual_step,
 )
+from jaxrock.engines.diffrax.static_with_arrays import StaticWithArrays
 from jaxrock.engines.events import WATCHED, Events, landed
 from jaxrock.engines.impact import impact
 from jaxrock.engines.rest import wait
@@ -45,15 +48,9 @@ from jaxrock.engines.scene import Scene
 from jaxrock.engines.state import Node, State
 from jaxrock.engines.stepper import AbstractEngine, AbstractStepper
 from jaxrock.models.equation import Angle
+from jaxrock.numerics.derivatives_of import with_derivatives_of
 from jaxrock.numerics.roots import carried
 from jaxrock.status import Status
-from jaxrock.transforms.branches import either
-from jaxrock.transforms.differentiation import differentiable, with_derivatives_of
-from jaxrock.transforms.held import Held
-
-Scalar = Inexact[Array, ""]
-Flag = Bool[Array, ""]
-Pair = Inexact[Array, "2"]  # opening angle, velocity per p t
 
 _ADJOINTS: dict[type, Any] = {
     diffrax.RecursiveCheckpointAdjoint: "checkpointed",
@@ -82,9 +79,9 @@ class Diffrax(AbstractEngine):
     **Raises:** ValueError for a value outside its range, or an adjoint that events do not go with.
     """
 
-    _solver: Held
-    _controller: Held
-    _adjoint: Held
+    _solver: StaticWithArrays
+    _controller: StaticWithArrays
+    _adjoint: StaticWithArrays
     rtol: float = eqx.field(static=True)
     atol: float | None = eqx.field(static=True)
     max_solves: int | None = eqx.field(static=True)
@@ -99,7 +96,11 @@ class Diffrax(AbstractEngine):
         adjoint: diffrax.AbstractAdjoint = diffrax.ForwardMode(),
         max_solves: Annotated[int | None, at_least(1, 10**9)] = None,
     ):
-        self._solver, self._controller, self._adjoint = Held.of(solver), Held.of(controller), Held.of(adjoint)
+        self._solver, self._controller, self._adjoint = (
+            StaticWithArrays.of(solver),
+            StaticWithArrays.of(controller),
+            StaticWithArrays.of(adjoint),
+        )
         self.rtol, self.atol, self.max_solves = rtol, atol, max_solves
 
     def __repr__(self) -> str:
@@ -147,7 +148,7 @@ class Diffrax(AbstractEngine):
 
     def budget(self, scene: Scene, history: bool) -> int:
         """Return the largest number of solves."""
-        usual = POLICY.solves + 4 * scene.most_pieces
+        usual = DIFFRAX_POLICY.solves + 4 * scene.most_pieces
         # Between impacts there are about four arcs, plus two passes of each bend; a history stores every arc, so its
         # bound is lower.
         return self.max_solves or usual + scene.moments.bends * (64 if history else usual // 2)
@@ -168,9 +169,9 @@ class Diffrax(AbstractEngine):
         rtol, least = self.within(scene.p.dtype)
         atol = max(self.atol or 1e-8 * rtol, least) * scene.alpha
         # A fraction of the time in which the forcing changes: a step sees at most one turn of it.
-        return jax.lax.stop_gradient((atol, jnp.minimum(POLICY.longest, scene.p * scene.scale(piece))))
+        return jax.lax.stop_gradient((atol, jnp.minimum(DIFFRAX_POLICY.longest, scene.p * scene.scale(piece))))
 
-    def solve(self, arc: Arc, limits: tuple[Scalar, Scalar], length: Scalar, event: diffrax.Event | None) -> Any:
+    def solve(self, arc: ArcProblem, limits: tuple[Scalar, Scalar], length: Scalar, event: diffrax.Event | None) -> Any:
         """Solve the arc, for `length` (p t) at most."""
         length = jnp.where(arc.side != 0, length, 0.0)
         # The first step is not cut to the length: `minimum` of two equal times halves both derivatives. Diffrax cuts
@@ -194,11 +195,11 @@ class Diffrax(AbstractEngine):
             stepsize_controller=controller,
             event=event,
             adjoint=self.adjoint,
-            max_steps=POLICY.solve_steps,
+            max_steps=DIFFRAX_POLICY.solve_steps,
             throw=False,
         )
 
-    def _begun(self, term: diffrax.ODETerm, zero: Scalar, y0: Pair, arc: Arc) -> PyTree:
+    def _begun(self, term: diffrax.ODETerm, zero: Scalar, y0: Pair, arc: ArcProblem) -> PyTree:
         """Return a solver state with its first stage evaluated, where the solver reuses the last stage (FSAL).
         Otherwise every step has a stage that only the first needs."""
         solver = self.solver
@@ -207,7 +208,7 @@ class Diffrax(AbstractEngine):
         return jnp.array(False), term.vf(zero, y0, arc)
 
     def locate(
-        self, arc: Arc, limits: tuple[Scalar, Scalar], length: Scalar, event: diffrax.Event
+        self, arc: ArcProblem, limits: tuple[Scalar, Scalar], length: Scalar, event: diffrax.Event
     ) -> tuple[Any, Scalar, Pair]:
         """Return the solution up to its event; its end (p t), and opening angle and velocity there, with their
         derivatives.
@@ -256,9 +257,9 @@ class ArcStepper(AbstractStepper):
         forcing = Forcing.of(scene, state)
         eps = float(jnp.finfo(scene.p.dtype).eps)
         resting = state.side == 0
-        waited = wait(self, state, forcing.shaking, forcing.unit, POLICY.order, eps, either)
+        waited = wait(self, state, forcing.shaking, forcing.unit, DIFFRAX_POLICY.order, eps, cond_select)
         rocked = self.on(state.side)._rock(state, forcing, ~resting)
-        after = checked(self, state, jax.tree.map(lambda a, b: jnp.where(resting, a, b), waited, rocked))
+        after = checked_step(self, state, jax.tree.map(lambda a, b: jnp.where(resting, a, b), waited, rocked))
         if self.history:
             return after
         # After the motion a block that has fallen back and turned below its saddle is safe: it only loses energy.
@@ -307,13 +308,13 @@ class ArcStepper(AbstractStepper):
     def evaluate(self, node: Node, elapsed: Scalar) -> tuple[Scalar, Scalar]:
         """Solve again from the node."""
         scene = self.scene.on(node.side)
-        arc = Arc.of(scene, node, Forcing.of(scene, node), self.history)
+        arc = ArcProblem.of(scene, node, Forcing.of(scene, node), self.history)
 
         def run(scene):
             engine, *arc = scene
             return engine.solve(*arc, event=None).ys[-1]
 
-        run = run if self.engine.reverse else differentiable(run)
+        run = run if self.engine.reverse else lane_function(run)
         time = self.scene.p * elapsed
         y = run((self.engine, arc, self.engine.limits(self.scene, node.piece), time))
         # A solve of zero length has no derivative with respect to its length.
@@ -328,10 +329,10 @@ class ArcStepper(AbstractStepper):
         lost = escaped(self, state, Angle.of(state.opening)) & (not self.history)
         room = jnp.where(rocking & ~lost, self.room(state), 0.0)
         rtol, _ = engine.within(scene.p.dtype)
-        share = POLICY.share * jnp.minimum(usual_step(rtol) / scene.p, scene.scale(state.piece))
+        share = DIFFRAX_POLICY.share * jnp.minimum(usual_step(rtol) / scene.p, scene.scale(state.piece))
         whole = room <= share
         length = scene.p * jnp.where(whole, room, jax.lax.stop_gradient(share))
-        arc = Arc.of(scene, state, forcing, self.history)
+        arc = ArcProblem.of(scene, state, forcing, self.history)
         arc = replace(arc, hop=is_hop(self, state, arc))
         eps = float(jnp.finfo(scene.p.dtype).eps)
         event = diffrax.Event(first_guard, Illinois(rtol=4 * eps, atol=0.0), direction=False)
@@ -373,12 +374,12 @@ class ArcStepper(AbstractStepper):
         after = replace(after, side=jnp.where(void, 0.0, after.side))
         return self._happen(state, after, arc, hits, y, lost, solution.result)
 
-    def _happen(self, before: State, after: State, arc: Arc, hits: Events, y: Pair, lost: Flag, result) -> State:
+    def _happen(self, before: State, after: State, arc: ArcProblem, hits: Events, y: Pair, lost: Flag, result) -> State:
         """Apply the event of an arc: peaks, margin, impact, verdict."""
         scene = self.scene
         outward = (before.velocity > 0) | ((before.velocity == 0) & (arc.start_acceleration >= 0))
         acceleration = arc.acceleration((after.local - before.local) * scene.p, y)
-        after = note(self, after, outward, hits.turning, hits.saddle, y[0], y[1], acceleration)
+        after = record_extrema(self, after, outward, hits.turning, hits.saddle, y[0], y[1], acceleration)
         quiet = before.piece >= scene.pieces
         forcing = Forcing.of(scene, after)
         reach = jnp.minimum(self.room(after), forcing.reach)

@@ -7,8 +7,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optimistix as optx
-from jaxtyping import Array, Bool, Inexact, Int
+from jaxtyping import Array, Inexact, Int
 
+from jaxrock._core.types import Flag, Scalar
+from jaxrock.compiler.hints import select
 from jaxrock.engines.events import Events
 from jaxrock.engines.scene import Scene
 from jaxrock.engines.state import Node, State
@@ -16,15 +18,12 @@ from jaxrock.engines.stepper import AbstractStepper
 from jaxrock.models.equation import AbstractMoments, Angle
 from jaxrock.motions.motion import AbstractMotion
 from jaxrock.motions.shaking import Shaking
-from jaxrock.numerics.choice import where
 from jaxrock.status import still_where
 
-Scalar = Inexact[Array, ""]
-Flag = Bool[Array, ""]
 Pair = Inexact[Array, "2"]  # opening angle, velocity per p t
 
 
-class Policy(NamedTuple):
+class _Policy(NamedTuple):
     """Settings of the diffrax engine that change times, but no result beyond its error.
 
     - `longest`: longest step of the default controller [1/p].
@@ -41,7 +40,7 @@ class Policy(NamedTuple):
     solves: int = 4096
 
 
-POLICY = Policy()
+DIFFRAX_POLICY = _Policy()
 _NOISE = 64  # error of an acceleration, in units of rounding
 
 
@@ -62,9 +61,9 @@ class Forcing(eqx.Module):
     @classmethod
     def of(cls, scene: Scene, state: State | Node) -> "Forcing":
         """Build the forcing from a state on."""
-        shaking, unit = scene.shaking(state.piece, state.local, POLICY.order)
+        shaking, unit = scene.shaking(state.piece, state.local, DIFFRAX_POLICY.order)
         piece = jnp.minimum(state.piece, scene.pieces - 1)
-        polynomial = all(terms is None or len(terms) <= POLICY.order for terms in shaking)
+        polynomial = all(terms is None or len(terms) <= DIFFRAX_POLICY.order for terms in shaking)
         motion = None if polynomial else scene.motion
         return cls(motion, shaking, unit, piece, state.local, state.piece < scene.pieces, scene.p)
 
@@ -87,7 +86,7 @@ class Forcing(eqx.Module):
         return jax.tree.map(lambda rate: rate / self.unit, self.shaking.steepest(0.25))
 
 
-def is_hop(stepper: AbstractStepper, state: State, arc: "Arc") -> Flag:
+def is_hop(stepper: AbstractStepper, state: State, arc: "ArcProblem") -> Flag:
     """Return whether a block that leaves the ground comes back at once, without a peak or a speed that matters.
 
     From the ground at speed v under a deceleration a it flies for 2 v/a. Let the deceleration change by less than a/2
@@ -109,7 +108,7 @@ def is_hop(stepper: AbstractStepper, state: State, arc: "Arc") -> Flag:
     return starts & certain & small & (not stepper.history)
 
 
-class Arc(eqx.Module):
+class ArcProblem(eqx.Module):
     """The smooth problem of one arc, and its guards; time is p t since its start."""
 
     moments: AbstractMoments
@@ -126,7 +125,7 @@ class Arc(eqx.Module):
     bend: Scalar | None  # next opening angle at which the moments bend; None: they are smooth everywhere
 
     @classmethod
-    def of(cls, scene: Scene, start: State | Node, forcing: Forcing, history: bool) -> "Arc":
+    def of(cls, scene: Scene, start: State | Node, forcing: Forcing, history: bool) -> "ArcProblem":
         """Build the arc from a state on."""
         zero, no = jnp.zeros_like(start.opening), jnp.zeros_like(start.opening, bool)
         flat = (start.opening < jnp.pi / 2) & (history or scene.falls_flat)
@@ -212,7 +211,7 @@ def _smooth(moments: AbstractMoments, start: State | Node, forcing: Forcing) -> 
         return moments, None
     acceleration, weight = forcing(jnp.zeros_like(start.opening))
     begins = moments.acceleration(Angle.of(start.opening), start.velocity, start.side * acceleration, weight)
-    return moments.ahead(start.opening, where(start.velocity == 0, begins >= 0, start.velocity > 0))
+    return moments.ahead(start.opening, select(start.velocity == 0, begins >= 0, start.velocity > 0))
 
 
 def _guard(time: Scalar, value: Scalar, jet: list[Scalar], active: Flag | bool) -> Scalar:
@@ -228,12 +227,12 @@ def _guard(time: Scalar, value: Scalar, jet: list[Scalar], active: Flag | bool) 
     return jnp.where(later, value / jnp.where(later, lead * power, 1.0), 1.0)
 
 
-def field(t, y, args: Arc):
+def field(t, y, args: ArcProblem):
     """Return the right-hand side, with the signature that diffrax expects."""
     return args.flow(t, y)
 
 
-def field_of_trials(t, y, args: Arc):
+def field_of_trials(t, y, args: ArcProblem):
     """Return the right-hand side for an implicit solver, with zero derivatives where it is not finite.
 
     A trial of the root finder may leave the domain of a user's equation. The solver rejects that step, but JAX
@@ -243,7 +242,7 @@ def field_of_trials(t, y, args: Arc):
     return still_where(~jnp.isfinite(found).all(), found)
 
 
-def first_guard(t, y, args: Arc, **kwargs):
+def first_guard(t, y, args: ArcProblem, **kwargs):
     """Return the smallest guard, with the signature that diffrax expects."""
     # Diffrax compares it with a zero of the default type, also where the scene is in single precision.
     return jnp.min(args.guards(t, y)).astype(jnp.result_type(float))
@@ -251,7 +250,7 @@ def first_guard(t, y, args: Arc, **kwargs):
 
 def usual_step(rtol: float) -> float:
     """Return the step (p t) that methods of order five take at this tolerance."""
-    return min(0.1 * (rtol / 1e-8) ** 0.2, POLICY.longest)
+    return min(0.1 * (rtol / 1e-8) ** 0.2, DIFFRAX_POLICY.longest)
 
 
 class StepControl(diffrax.PIDController):
@@ -265,7 +264,7 @@ class StepControl(diffrax.PIDController):
         return super().init(terms, t0, t1, y0, self.first, args, func, error_order)
 
 
-def first_step(arc: Arc, rtol: float) -> Scalar:
+def first_step(arc: ArcProblem, rtol: float) -> Scalar:
     """Return a first step (p t) that does not jump over a small hop.
 
     It is half the way back to the ground, or slightly more than the whole way for a certain hop.

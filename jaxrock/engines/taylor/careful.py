@@ -16,11 +16,14 @@ from typing import Annotated, Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Inexact, Int, PyTree
+from jaxtyping import Array, Int, PyTree
 
-from jaxrock._arguments import at_least, check_fields, known
-from jaxrock._checks import inner_share
-from jaxrock.engines.bookkeeping import checked, errors_after, escaped, note
+from jaxrock._arguments.annotations import at_least, check_fields, known
+from jaxrock._arguments.ranges import inner_share
+from jaxrock._core.types import Flag, Scalar
+from jaxrock.compiler import cond_any, lane_function
+from jaxrock.compiler.hints import materialize, opaque_one, select, stop_gradient
+from jaxrock.engines.bookkeeping import checked_step, errors_after, escaped, record_extrema
 from jaxrock.engines.events import WATCHED, Events, landed, level_of
 from jaxrock.engines.free_stage import FreeStage, Visit, free_stage
 from jaxrock.engines.impact import impact
@@ -28,15 +31,14 @@ from jaxrock.engines.rest import wait
 from jaxrock.engines.scene import Scene
 from jaxrock.engines.state import Node, State, surpasses
 from jaxrock.engines.stepper import AbstractEngine, AbstractStepper
-from jaxrock.engines.taylor.expansion import End, Start, arrive, expand, extreme_speed
-from jaxrock.engines.taylor.outset import clear_start, overshoot, signs_at_start, unbalanced
+from jaxrock.engines.taylor.expansion import End, Start, arrive, extreme_speed, taylor_expansion
 from jaxrock.engines.taylor.policy import POLICY, exact
+from jaxrock.engines.taylor.step_start import clear_start, overshoot, signs_at_start, unbalanced
 from jaxrock.engines.taylor.tape import end_on_tape, on_tape
 from jaxrock.models.coefficients import Coefficients
 from jaxrock.models.equation import Angle
 from jaxrock.motions.shaking import Shaking
-from jaxrock.numerics.choice import where
-from jaxrock.numerics.fixed import fixed
+from jaxrock.numerics.derivatives_of import with_derivatives_of
 from jaxrock.numerics.polynomial import (
     Watch,
     derivative,
@@ -48,13 +50,7 @@ from jaxrock.numerics.polynomial import (
     rescaled,
     step_length,
 )
-from jaxrock.numerics.xla_cpu import keep, unseen_one
 from jaxrock.status import Status
-from jaxrock.transforms.branches import when
-from jaxrock.transforms.differentiation import differentiable, with_derivatives_of
-
-Scalar = Inexact[Array, ""]
-Flag = Bool[Array, ""]
 
 
 class Series(AbstractEngine):
@@ -122,7 +118,7 @@ class TaylorStepper(AbstractStepper):
     def shaking(self, piece: Int[Array, ""], local: Scalar) -> tuple[Shaking, Scalar]:
         """Return Taylor coefficients of the ground acceleration [g] in a piece, in time/unit, and the unit [s]."""
         shaking, unit = self.scene.shaking(piece, local, self.order)
-        return shaking.each(lambda terms: [keep(u, local) for u in terms]), keep(unit, local)
+        return shaking.each(lambda terms: [materialize(u, local) for u in terms]), materialize(unit, local)
 
     @property
     def rounding(self) -> float:
@@ -141,9 +137,9 @@ class TaylorStepper(AbstractStepper):
     def step(self, state: State, shaking: Shaking, unit: Scalar) -> State:
         """Advance a lane by one step: a wait at rest, or rocking."""
         resting = state.side == 0
-        waited = wait(self, state, shaking, unit, self.order, self.tolerance, when)
+        waited = wait(self, state, shaking, unit, self.order, self.tolerance, cond_any)
         rocked = self.on(state.side)._rock(state, shaking, unit, ~resting)
-        return checked(self, state, jax.tree.map(lambda a, b: where(resting, a, b), waited, rocked))
+        return checked_step(self, state, jax.tree.map(lambda a, b: select(resting, a, b), waited, rocked))
 
     def on_tape(self, state: State, budget: int) -> tuple[State, State]:
         """Follow a block so that reverse mode differentiates its steps, and return all states, as `states_of`."""
@@ -167,14 +163,14 @@ class TaylorStepper(AbstractStepper):
         if self.taped:
             # In reverse mode the branch not taken (roots of zero) would spoil the other.
             name = "free stage, to pi/2" if scene.falls_flat else "free stage"
-            stage = differentiable(
-                lambda start: free_stage(*start, falls_flat=scene.falls_flat), name=name, in_lanes=True
+            stage = lane_function(
+                lambda start: free_stage(*start, falls_flat=scene.falls_flat), key=name, in_lanes=True
             )(start)
         else:
             none = FreeStage.none(state.opening)
             stage = jax.lax.cond(moving, lambda: free_stage(*start, falls_flat=scene.falls_flat), lambda: none)
         # A loss after one more impact is a new excursion; otherwise this excursion may have been closer before.
-        beyond = where(stage.impacts > 0, stage.closeness, jnp.minimum(state.closeness_beyond, stage.closeness))
+        beyond = select(stage.impacts > 0, stage.closeness, jnp.minimum(state.closeness_beyond, stage.closeness))
         higher = surpasses(stage.peak, state.peak)
         # The energy missing to the saddle, 2 (E_saddle - E), and its error.
         slope = -2 * moments.restoring(Angle.of(state.opening))
@@ -186,19 +182,19 @@ class TaylorStepper(AbstractStepper):
         )
         toss_up = toss_up & (state.status == Status.successful)
         flat = stage.peak_steepness <= 0
-        error = where(flat, off, off * stage.peak_share / where(flat, 1.0, stage.peak_steepness))
+        error = select(flat, off, off * stage.peak_share / select(flat, 1.0, stage.peak_steepness))
         # Peaks come from the energy missing to the saddle: small peaks have lost digits.
-        lost = where(moving, 4 * self.rounding * moments.saddle, 0.0)
+        lost = select(moving, 4 * self.rounding * moments.saddle, 0.0)
         return replace(
             state,
             overturned=state.overturned | stage.overturned,
             closeness=jnp.minimum(state.closeness, stage.closeness),
             closeness_beyond=beyond,
-            peak=where(stage.peak > state.peak, stage.peak, state.peak),
+            peak=select(stage.peak > state.peak, stage.peak, state.peak),
             second=jnp.maximum(state.second, jnp.minimum(state.peak, stage.peak)),
-            peak_clearance=where(stage.peak > state.peak, state.clearance, state.peak_clearance),
-            peak_time=where(higher, self.time(state) + stage.peak_time / scene.p, state.peak_time),
-            error=fixed(where(higher, error, state.error) + lost),
+            peak_clearance=select(stage.peak > state.peak, state.clearance, state.peak_clearance),
+            peak_time=select(higher, self.time(state) + stage.peak_time / scene.p, state.peak_time),
+            error=stop_gradient(select(higher, error, state.error) + lost),
             fastest=jnp.maximum(state.fastest, stage.fastest),
             impacts=state.impacts + stage.impacts,
             status=Status.where(toss_up, Status.undecided, state.status),
@@ -207,13 +203,13 @@ class TaylorStepper(AbstractStepper):
     def evaluate(self, node: Node, elapsed: Scalar) -> tuple[Scalar, Scalar]:
         """Evaluate the history by a new series about the node."""
         shaking, unit = self.shaking(node.piece, node.local)
-        coefficients = expand(self.on(node.side).start(node, shaking, unit), self.order).opening
+        coefficients = taylor_expansion(self.on(node.side).start(node, shaking, unit), self.order).opening
         opening, speed = jet(coefficients, elapsed / unit, 1)
         return opening, speed / unit
 
     def start(self, state: State | Node, shaking: Shaking, unit: Scalar) -> Start:
         """Return the start of a step, with time in `unit`."""
-        stretch = jnp.ones_like(unit) if self.scene.scales is None else keep(self.scene.p * unit, state.local)
+        stretch = jnp.ones_like(unit) if self.scene.scales is None else materialize(self.scene.p * unit, state.local)
         moments: Any = self.scene.moments
         return Start(
             moments.bare,
@@ -223,7 +219,7 @@ class TaylorStepper(AbstractStepper):
             state.opening,
             state.velocity * stretch,
             shaking,
-            unseen_one(state.local),
+            opaque_one(state.local),
         )
 
     def _rock(self, state: State, shaking: Shaking, unit: Scalar, rocking: Flag) -> State:
@@ -231,9 +227,9 @@ class TaylorStepper(AbstractStepper):
         # A step cannot use more room than that; the bound keeps it finite.
         start, room = self.start(state, shaking, unit), jnp.minimum(self.room(state), 32 * unit) / unit
         # The step is found without derivatives; then its end moves as the flow and the event determine.
-        stepper, before, begin, reach = fixed((self, state, start, room))
+        stepper, before, begin, reach = stop_gradient((self, state, start, room))
         step = _Step.of(stepper, before, begin, reach, rocking)
-        cut = when(step.eventful, lambda cut, *when: stepper._cut(before, step, *when), step.whole)
+        cut = cond_any(step.eventful, lambda cut, *flags: stepper._cut(before, step, *flags), step.whole)
         hits = cut.hits
         early = cut.length < step.length
         full = step.full & ~early
@@ -252,12 +248,12 @@ class TaylorStepper(AbstractStepper):
         piece, local, over = self.move_on(state, elapsed, full)
         lost = escaped(self, state, start.angle)
         moved = (step.length > 0) & rocking
-        time = where(step.length > 0, step.length * start.stretch, jnp.inf)
+        time = select(step.length > 0, step.length * start.stretch, jnp.inf)
         missed = step.rounded + step.missed, step.rounded + step.missed * jnp.maximum(self.order / time, 1.0)
         # A zero-length step keeps the velocity bitwise; its derivatives follow those of coinciding knots.
-        kept = where(rocking, with_derivatives_of(state.velocity, velocity), state.velocity)
-        exact = landed(self.scene, hits, opening, where(moved, velocity, kept))
-        jerk = where(hits.extremum, jet(derivative(step.coefficients), length, 2)[2], jnp.inf)
+        kept = select(rocking, with_derivatives_of(state.velocity, velocity), state.velocity)
+        exact = landed(self.scene, hits, opening, select(moved, velocity, kept))
+        jerk = select(hits.extremum, jet(derivative(step.coefficients), length, 2)[2], jnp.inf)
         fastest = extreme_speed(start, length, opening, speed, jerk) / start.stretch
         passed = replace(
             state,
@@ -268,15 +264,15 @@ class TaylorStepper(AbstractStepper):
             velocity=exact[1],
             beyond=state.beyond ^ hits.saddle,
             uplifting=state.uplifting & ~moved,
-            extremal=where(moved, hits.extremum, state.extremal),
-            fastest=where(moved, jnp.maximum(state.fastest, fastest), state.fastest),
+            extremal=select(moved, hits.extremum, state.extremal),
+            fastest=select(moved, jnp.maximum(state.fastest, fastest), state.fastest),
             done=over,
         )
 
         def happen(passed, needed, inside):
             return self._happen(state, passed, start, step, (length, opening, velocity), cut, inside)
 
-        stepped = when(step.eventful & (hits.impact | hits.turning | hits.saddle), happen, passed)
+        stepped = cond_any(step.eventful & (hits.impact | hits.turning | hits.saddle), happen, passed)
         down = stepped.opening >= jnp.pi / 2
         overturned = state.overturned | lost | down if self.scene.falls_flat else state.overturned | lost
         # A history continues to the ground; for an outcome the verdict is enough.
@@ -288,7 +284,7 @@ class TaylorStepper(AbstractStepper):
         length, saddle = inside(step.length), self.scene.moments.saddle
         scaled = [inside(c) for c in rescaled(step.coefficients, length)]
         one = jnp.ones_like(length)
-        signs = Events(one, *step.signs, where(state.beyond, 1.0, -1.0), -one)
+        signs = Events(one, *step.signs, select(state.beyond, 1.0, -1.0), -one)
         below = state.opening < jnp.pi / 2 if self.history else None  # an outcome needs no fall down to the ground
         wanted = Events(True, ~step.monotone | self._matters(state, scaled), step.faster, True, below)
         watches = [
@@ -311,11 +307,13 @@ class TaylorStepper(AbstractStepper):
         law = self.scene.moments.acceleration(Angle.of(opening), velocity, state.side * ground[0], ground[1])
         acceleration = with_derivatives_of(cut.acceleration / start.stretch**2, law)
         hits = cut.hits
-        noted = note(self, passed, step.signs[0] > 0, hits.turning, hits.saddle, opening, velocity, acceleration)
+        noted = record_extrema(
+            self, passed, step.signs[0] > 0, hits.turning, hits.saddle, opening, velocity, acceleration
+        )
         unit = start.stretch / self.scene.p
         steepest = jax.tree.map(lambda rate: rate / unit, shaking.steepest(step.length))
         reach = (step.length - length) * unit
-        return impact(self, noted, hits.impact, velocity, ground, *fixed((steepest, reach)))
+        return impact(self, noted, hits.impact, velocity, ground, *stop_gradient((steepest, reach)))
 
     def _matters(self, state: State, scaled) -> Flag:
         """Return whether the only turning point of this step could be a new peak, or closer to overturning than
@@ -326,8 +324,8 @@ class TaylorStepper(AbstractStepper):
         # The opening angle stays below c0 + c1 x - fall x^2, whose top is c0 + c1^2/(4 fall).
         moments = self.scene.moments
         fall = -scaled[2] - sum(jnp.maximum(c, 0.0) for c in scaled[3:])
-        rise = jnp.maximum(scaled[1], 0.0) ** 2 / (4 * where(fall > 0, fall, 1.0))
-        top = where(fall > 0, jnp.minimum(state.opening + rise, moments.saddle), moments.saddle)
+        rise = jnp.maximum(scaled[1], 0.0) ** 2 / (4 * select(fall > 0, fall, 1.0))
+        top = select(fall > 0, jnp.minimum(state.opening + rise, moments.saddle), moments.saddle)
         least = (moments.restoring(Angle.of(top)) / moments.restoring_at_rest) ** 2
         inward = state.velocity < 0  # it may graze the ground
         return inward | state.beyond | (top >= 0.999 * state.peak) | (least < state.closeness)  # 0.999: near ties, too
@@ -361,20 +359,22 @@ class _Step(NamedTuple):
     def of(cls, stepper: TaylorStepper, state: State, start: Start, room: Scalar, rocking: Flag) -> "_Step":
         """Compute the step from a state on."""
         scene, order = stepper.scene, stepper.order
-        coefficients = unbalanced(expand(start, order).opening)
+        coefficients = unbalanced(taylor_expansion(start, order).opening)
         # Relative to the motion itself while it is small: tiny rotations keep their digits, too.
         size = functools.reduce(jnp.maximum, [jnp.abs(c) for c in coefficients[: max(order // 2, 4)]])
         size = jnp.minimum(scene.alpha, size)
         length = step_length(coefficients, stepper.tolerance * size, jnp.minimum(room, stepper.longest))
         full = length >= room * (1 - 1e-9)
-        length = keep(where(full, room, length), state.local)
-        opening, speed = (keep(value, state.local) for value in jet(coefficients, length, 1))
+        length = materialize(select(full, room, length), state.local)
+        opening, speed = (materialize(value, state.local) for value in jet(coefficients, length, 1))
 
         signs = signs_at_start(state, coefficients)
-        turning = keep(keeps_sign(derivative(coefficients), signs[0], length), state.local) <= 0
+        turning = materialize(keeps_sign(derivative(coefficients), signs[0], length), state.local) <= 0
         crossing = (opening >= scene.moments.saddle) != state.beyond
-        top = jnp.maximum(jnp.abs(coefficients[1]), jnp.abs(speed)) + keep(overshoot(coefficients, length), state.local)
-        monotone = keep(keeps_sign(derivative(derivative(coefficients)), signs[1], length), state.local) > 0
+        top = jnp.maximum(jnp.abs(coefficients[1]), jnp.abs(speed)) + materialize(
+            overshoot(coefficients, length), state.local
+        )
+        monotone = materialize(keeps_sign(derivative(derivative(coefficients)), signs[1], length), state.local) > 0
         faster = (top > state.fastest * start.stretch) & ~monotone
         eventful = turning | crossing | faster | (opening <= 0)
         if stepper.history:

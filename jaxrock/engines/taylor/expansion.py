@@ -12,19 +12,14 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Inexact
 
+from jaxrock._core.types import Flag, Scalar
+from jaxrock.compiler import custom_tangent
+from jaxrock.compiler.hints import materialize, materialize_by, select, stop_gradient
 from jaxrock.models.coefficients import Basis, Coefficients
 from jaxrock.models.equation import Angle
 from jaxrock.motions.shaking import Shaking
-from jaxrock.numerics.choice import where
-from jaxrock.numerics.fixed import fixed
-from jaxrock.numerics.given import given, is_zero
 from jaxrock.numerics.polynomial import product_term, sum_of_products
-from jaxrock.numerics.xla_cpu import keep, keep_by
-
-Scalar = Inexact[Array, ""]
-Flag = Bool[Array, ""]
 
 
 class Start(NamedTuple):
@@ -43,7 +38,7 @@ class Start(NamedTuple):
     def angle(self) -> Angle:
         """Return the opening angle with its sine and cosine."""
         angle = Angle.of(self.opening)
-        return Angle(angle.value, keep_by(angle.sine, self.one), keep_by(angle.cosine, self.one))
+        return Angle(angle.value, materialize_by(angle.sine, self.one), materialize_by(angle.cosine, self.one))
 
 
 class End(NamedTuple):
@@ -71,7 +66,7 @@ class Expansion(NamedTuple):
     restoring: list[Scalar | None]
 
 
-def expand(start: Start, order: int) -> Expansion:
+def taylor_expansion(start: Start, order: int) -> Expansion:
     """Compute the series of x'' = -stretch^2 [(1 + v) restoring(x) + side u arm(x)].
 
     The sine and cosine of the angle follow their own recurrences (Jorba & Zou 2005).
@@ -79,20 +74,20 @@ def expand(start: Start, order: int) -> Expansion:
     moments, angle, one = start.moments, start.angle, start.one
     x, slopes = [angle.value, start.speed], [start.speed]  # slopes: (k + 1) x_{k+1}
     sine, cosine, arms, restorings = [angle.sine], [angle.cosine], [], []
-    scale = keep_by(-(start.stretch**2), one)
-    pushes = [keep_by(scale * start.side, one) * u for u in start.shaking.horizontal]
-    scaled = moments.restoring_terms.each(lambda c: keep_by(scale * c, one))
+    scale = materialize_by(-(start.stretch**2), one)
+    pushes = [materialize_by(scale * start.side, one) * u for u in start.shaking.horizontal]
+    scaled = moments.restoring_terms.each(lambda c: materialize_by(scale * c, one))
     # Under a straight line every term is a few products, of the moment and the arm together; the oldest come first.
     straight = start.shaking.vertical is None and len(pushes) <= 2
-    now, *before = (moments.arm_terms.each(lambda c, push=push: keep_by(push * c, one)) for push in pushes)
+    now, *before = (moments.arm_terms.each(lambda c, push=push: materialize_by(push * c, one)) for push in pushes)
     now, last = now.plus(scaled), None
     for k in range(order - 1):
         if moments.trigonometric and k > 0:
-            sine.append(keep_by(product_term(slopes, cosine, k - 1) * (1 / k), one))
-            cosine.append(keep_by(product_term(slopes, sine, k - 1) * (-1 / k), one))
+            sine.append(materialize_by(product_term(slopes, cosine, k - 1) * (1 / k), one))
+            cosine.append(materialize_by(product_term(slopes, sine, k - 1) * (-1 / k), one))
         basis = Basis.of_term(k, x, sine, cosine)
         arm = moments.arm_terms.summed(basis, empty=None)
-        arms.append(arm if arm is None else keep_by(arm, one))
+        arms.append(arm if arm is None else materialize_by(arm, one))
         if straight:
             products = before[0].products(last) if before and last else []
             moment = functools.reduce(operator.add, products + now.products(basis))
@@ -104,9 +99,9 @@ def expand(start: Start, order: int) -> Expansion:
         if start.shaking.vertical is not None:
             restorings.append(moments.restoring_terms.summed(basis, empty=None))
             moment = moment + scale * product_term(start.shaking.vertical, restorings, k)
-        slope = keep_by(moment * (1 / (k + 1)), one)
+        slope = materialize_by(moment * (1 / (k + 1)), one)
         if k == 0:
-            slope = where(start.uplifting, 0.0, slope)  # by continuity, exactly
+            slope = select(start.uplifting, 0.0, slope)  # by continuity, exactly
         slopes.append(slope)
         x.append(slope * (1 / (k + 2)))
     return Expansion(x, slopes, sine, cosine, arms, restorings)
@@ -119,8 +114,8 @@ class _Weights(NamedTuple):
 
     def times(self, change: Start) -> Any:
         """Return the change of the end."""
-        pairs = zip(jax.tree.leaves(self.start), jax.tree.leaves(change, is_leaf=is_zero), strict=True)
-        return _summed((weight, moved) for weight, moved in pairs if not is_zero(moved))
+        pairs = zip(*(jax.tree.leaves(x, is_leaf=lambda x: x is None) for x in (self.start, change)), strict=True)
+        return _summed((weight, moved) for weight, moved in pairs if moved is not None)
 
 
 def _summed(pairs: Iterable[tuple[Scalar, Scalar]]) -> Any:
@@ -133,7 +128,7 @@ def _weighed(terms: list | None, vertical: list[Scalar] | None, order: int, like
     """Return a series times 1 + v, where the model has that series."""
     if vertical is None or terms is None or len(terms) < order - 1:
         return terms
-    return [terms[k] + keep(product_term(vertical, terms, k), like) for k in range(order - 1)]
+    return [terms[k] + materialize(product_term(vertical, terms, k), like) for k in range(order - 1)]
 
 
 class _Sources(NamedTuple):
@@ -149,7 +144,9 @@ class _Sources(NamedTuple):
         arm = start.moments.arm_terms
         needed = arm.line is not None, arm.trigonometric, arm.trigonometric
         pushed = [
-            [keep(product_term(horizontal, terms, k), start.stretch) for k in range(order - 1)] if wanted else None
+            [materialize(product_term(horizontal, terms, k), start.stretch) for k in range(order - 1)]
+            if wanted
+            else None
             for wanted, terms in zip(needed, (series.opening, series.sine, series.cosine))
         ]
         constant = [jnp.ones_like(like)] + [None if vertical is None else jnp.zeros_like(like)] * (order - 2)
@@ -169,7 +166,7 @@ class _Sources(NamedTuple):
             restoring, arm = (basis.term(k).derivative for basis in (self.restoring, self.arm))
             terms = moments.restoring_terms.products(restoring)
             terms += moments.arm_terms.products(arm, side)
-            return keep(sum(terms), start.stretch)
+            return materialize(sum(terms), start.stretch)
 
         return [of(k) for k in (range(1) if constant_pull else range(order - 1))]
 
@@ -182,22 +179,22 @@ def _weights(order: int, start: Start, length: Scalar) -> tuple[_Weights, _Weigh
     coefficient m, `of_source[k]` by source k.
     """
     side, stretch = start.side, start.stretch
-    series = expand(start, order)
+    series = taylor_expansion(start, order)
     sources = _Sources.of(start, series, order, length)
     pulls = sources.pulls(start, order)
     powers = [jnp.ones_like(length)]
     for _ in range(order):
-        powers.append(keep(powers[-1] * length, stretch))
+        powers.append(materialize(powers[-1] * length, stretch))
     scale = -(stretch**2)
 
     def backwards(own):
         of_term, of_source = [None] * (order + 1), [None] * (order - 1)
         for m in range(order, -1, -1):
             later = _summed((of_source[k], pulls[k - m]) for k in range(m, min(order - 1, m + len(pulls))))
-            of_term[m] = keep(own[m] + later, stretch)
+            of_term[m] = materialize(own[m] + later, stretch)
             if m >= 2:
                 source = of_term[m] * scale * (1 / (m * (m - 1)))
-                of_source[m - 2] = keep(where(start.uplifting, 0.0, source) if m == 2 else source, stretch)
+                of_source[m - 2] = materialize(select(start.uplifting, 0.0, source) if m == 2 else source, stretch)
         return of_term, of_source
 
     def of(own):
@@ -234,7 +231,7 @@ def arrive(order: int, start: Start, end: End) -> tuple[Scalar, Scalar, Scalar]:
 
     Derivatives come only from `start`, and from `end.level` and `end.room`: the other values in `end` need none.
     """
-    return given(_arriving, (end.length, end.opening, end.speed), (start, end), order)
+    return custom_tangent(_arriving, (end.length, end.opening, end.speed), (start, end), order)
 
 
 def _arriving(order: int, values: tuple, by: tuple[Start, End], changes: tuple) -> tuple:
@@ -243,11 +240,11 @@ def _arriving(order: int, values: tuple, by: tuple[Start, End], changes: tuple) 
     push, weight = start.shaking.at(length)
     law = start.moments.acceleration(Angle.of(opening), speed, start.side * push, weight)
     acceleration = start.stretch**2 * law
-    d_level, d_room = (0.0 if is_zero(d) else d for d in (d_end.level, d_end.room))
+    d_level, d_room = (0.0 if d is None else d for d in (d_end.level, d_end.room))
     # An end that is grazed has no derivative: infinity, which the status reports.
-    d_length = where(end.full, d_room, 0.0)
-    d_length = where(end.turns, -d_speed / where(end.turns, acceleration, 1.0), d_length)
-    d_length = where(end.meets, (d_level - d_opening) / where(end.meets, speed, 1.0), d_length)
+    d_length = select(end.full, d_room, 0.0)
+    d_length = select(end.turns, -d_speed / select(end.turns, acceleration, 1.0), d_length)
+    d_length = select(end.meets, (d_level - d_opening) / select(end.meets, speed, 1.0), d_length)
     moved = d_length, d_opening + speed * d_length, d_speed + acceleration * d_length
     return tuple(jnp.broadcast_to(d, length.shape) for d in moved)
 
@@ -260,11 +257,11 @@ def extreme_speed(start: Start, length: Scalar, opening: Scalar, speed: Scalar, 
     """
     push, weight = start.shaking.at(length)
     law = start.moments.acceleration(Angle.of(opening), speed / start.stretch, start.side * push, weight)
-    return given(_extreme, jnp.abs(speed), (speed, start.stretch**2 * law, fixed(jerk)))
+    return custom_tangent(_extreme, jnp.abs(speed), (speed, start.stretch**2 * law, stop_gradient(jerk)))
 
 
 def _extreme(_, by: tuple, changes: tuple) -> Scalar:
     """Differentiate |v - a^2/(2 j)|, in which a is zero, but not its derivatives."""
     (speed, acceleration, jerk), (change, steeper, _) = by, changes
-    change, steeper = (jnp.zeros_like(speed) if is_zero(d) else d for d in (change, steeper))
+    change, steeper = (jnp.zeros_like(speed) if d is None else d for d in (change, steeper))
     return jnp.sign(speed) * (change - acceleration / jerk * steeper)

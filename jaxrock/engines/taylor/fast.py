@@ -12,25 +12,21 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Inexact
 
-from jaxrock.engines.bookkeeping import checked, errors_after, escaped, note
+from jaxrock._core.types import Flag, Scalar
+from jaxrock.compiler.hints import materialize, materialize_by, materialize_flag, select
+from jaxrock.engines.bookkeeping import checked_step, errors_after, escaped, record_extrema
 from jaxrock.engines.events import Events, landed
 from jaxrock.engines.impact import impact
 from jaxrock.engines.rest import lift, longest_wait
 from jaxrock.engines.state import State
 from jaxrock.engines.taylor.careful import TaylorStepper
-from jaxrock.engines.taylor.expansion import Start, expand
-from jaxrock.engines.taylor.outset import first_sign
+from jaxrock.engines.taylor.expansion import Start, taylor_expansion
 from jaxrock.engines.taylor.policy import POLICY
-from jaxrock.numerics.choice import where
+from jaxrock.engines.taylor.step_start import first_sign
 from jaxrock.numerics.newton import is_found, root_between
 from jaxrock.numerics.polynomial import derivative, horner, jet, keeps_sign, last_size, step_length
-from jaxrock.numerics.xla_cpu import keep, keep_by, keep_flag
 from jaxrock.status import Status
-
-Scalar = Inexact[Array, ""]
-Flag = Bool[Array, ""]
 
 # Degrees of the polynomials for Newton's first iterations, where the series has degree 16 or less (else in proportion).
 # They serve a value that is stationary at the root, the time of a turning point, and the meeting of a level.
@@ -58,7 +54,7 @@ def _certified(terms: list[Scalar], length: Scalar, rises: Scalar) -> Scalar:
     def shorter():
         share = jnp.zeros_like(length)
         for part in reversed(POLICY.shorter):
-            share = where(sure(part), part, share)
+            share = select(sure(part), part, share)
         return share
 
     return _if(~sure(1.0), shorter, jnp.ones_like(length))
@@ -87,17 +83,17 @@ def _part(start: Start, terms: list[Scalar], room: Scalar, least: Scalar, most: 
     short = ~(last_size(terms) * cap ** (len(terms) - 1) <= least)
     longest = _if(short, lambda: step_length(terms, least, cap), cap)
     reaches = longest >= room * (1 - 1e-9)
-    longest = keep_by(where(reaches, room, longest), one)
-    rises = where(start.uplifting, 1.0, first_sign(terms[2], terms[3]))
-    outward = where(start.uplifting, 1.0, first_sign(before, rises))
-    share = keep_by(_certified(terms, longest, rises), one)
+    longest = materialize_by(select(reaches, room, longest), one)
+    rises = select(start.uplifting, 1.0, first_sign(terms[2], terms[3]))
+    outward = select(start.uplifting, 1.0, first_sign(before, rises))
+    share = materialize_by(_certified(terms, longest, rises), one)
 
     def extremum(length):
-        opening, speed, acceleration = (keep_by(x, one) for x in jet(terms, length, 2))
+        opening, speed, acceleration = (materialize_by(x, one) for x in jet(terms, length, 2))
         has_extremum = rises * acceleration < 0
 
         def where_tangents_meet():
-            turn = where(has_extremum, first - acceleration, 1.0)
+            turn = select(has_extremum, first - acceleration, 1.0)
             return before + first * ((speed - before - acceleration * length) / turn)
 
         bound = _if(has_extremum, where_tangents_meet, before)
@@ -108,13 +104,13 @@ def _part(start: Start, terms: list[Scalar], room: Scalar, least: Scalar, most: 
             has_extremum & (outward * speed >= 0) & (outward * bound <= 0),
         )
 
-    length = keep_by(share * longest, one)
+    length = materialize_by(share * longest, one)
     end, has_extremum, bound, twice = extremum(share * longest)
     whole, slowing = (length, end, has_extremum, bound, twice), end[2]
 
     def shorter():
         # Where the velocity may turn twice, the part ends about where the acceleration is zero.
-        length = keep_by(share * longest * first / where(twice, first - slowing, 1.0), one)
+        length = materialize_by(share * longest * first / select(twice, first - slowing, 1.0), one)
         return length, *extremum(length)
 
     length, end, has_extremum, bound, still = _if(twice, shorter, whole)
@@ -131,11 +127,11 @@ def _leaving(start: Start, terms: list[Scalar], part: _Part) -> tuple:
     """
     velocity, length = derivative(terms), part.length
     still = velocity[0] == 0
-    later = [where(start.uplifting, b, a) for a, b in zip(velocity[1:], [*velocity[2:], jnp.zeros_like(length)])]
-    left = [where(still, b, a) for a, b in zip(velocity, [*later, jnp.zeros_like(length)])]
-    power = where(start.uplifting, 2.0, where(still, 1.0, 0.0))
-    per_time = where(still, 1 / length, 0.0)
-    share = where(start.uplifting, per_time * per_time, where(still, per_time, 1.0))
+    later = [select(start.uplifting, b, a) for a, b in zip(velocity[1:], [*velocity[2:], jnp.zeros_like(length)])]
+    left = [select(still, b, a) for a, b in zip(velocity, [*later, jnp.zeros_like(length)])]
+    power = select(start.uplifting, 2.0, select(still, 1.0, 0.0))
+    per_time = select(still, 1 / length, 0.0)
+    share = select(start.uplifting, per_time * per_time, select(still, per_time, 1.0))
     slope = (part.acceleration - power * part.speed * per_time) * share
     return left, jnp.zeros_like(length), length, (left[0], part.speed * share), (left[1], slope)
 
@@ -158,12 +154,12 @@ class _Meeting(NamedTuple):
 def _meeting(start: Start, terms: list[Scalar], part: _Part, state: State) -> _Meeting:
     """Find the turning point within a part, and the first level that it meets, before or after it turns."""
     one, saddle, zero = start.one, start.moments.saddle, jnp.zeros_like(part.length)
-    turns = keep_flag(part.outward * part.speed < 0, state.local)
+    turns = materialize_flag(part.outward * part.speed < 0, state.local)
 
     def turn():
         x, last = root_between(_TURN, *_leaving(start, terms, part))
-        x = keep_by(x, one)
-        opening, _, acceleration = (keep_by(value, one) for value in jet(terms, x, 2))
+        x = materialize_by(x, one)
+        opening, _, acceleration = (materialize_by(value, one) for value in jet(terms, x, 2))
         return x, opening, acceleration, is_found(x, last, 1e-6) & (x > 0)
 
     turn_at, top, top_acceleration, sure = _if(
@@ -176,20 +172,20 @@ def _meeting(start: Start, terms: list[Scalar], part: _Part, state: State) -> _M
     # If it turns before it crosses, the step ends where it turns.
     stops = ~early & turns & ((part.opening >= saddle) != (top >= saddle))
     impact = ~crossing & ((top <= 0) | (turns & ~stops & (part.opening <= 0)))
-    crossing, impact, stops = (keep_flag(x, state.local) for x in (crossing, impact, stops))
-    level = where(crossing, saddle, 0.0)
-    low, high = where(early, 0.0, turn_at), where(early, turn_at, part.length)
-    at_low = where(early, terms[0], top) - level
-    at_high = where(early, top, part.opening) - level
-    slopes = where(early, terms[1], 0.0), where(early & turns, 0.0, part.speed)
+    crossing, impact, stops = (materialize_flag(x, state.local) for x in (crossing, impact, stops))
+    level = select(crossing, saddle, 0.0)
+    low, high = select(early, 0.0, turn_at), select(early, turn_at, part.length)
+    at_low = select(early, terms[0], top) - level
+    at_high = select(early, top, part.opening) - level
+    slopes = select(early, terms[1], 0.0), select(early & turns, 0.0, part.speed)
 
     def meet():
         x, last = root_between(_MEET, [terms[0] - level, *terms[1:]], low, high, (at_low, at_high), slopes)
-        x = keep_by(x, one)
-        return x, *(keep_by(value, one) for value in jet(terms, x, 2)), certain & is_found(x, last)
+        x = materialize_by(x, one)
+        return x, *(materialize_by(value, one) for value in jet(terms, x, 2)), certain & is_found(x, last)
 
     def at_end(of_turn, of_part):
-        return where(stops, of_turn, of_part)
+        return select(stops, of_turn, of_part)
 
     otherwise = at_end(turn_at, part.length), at_end(top, part.opening), at_end(zero, part.speed)
     otherwise = *otherwise, at_end(top_acceleration, part.acceleration), certain
@@ -209,7 +205,7 @@ def _fastest(start: Start, terms: list[Scalar], part: _Part, at: Scalar, known: 
         x, last = root_between(
             _FLAT, derivative(velocity), zero, part.length, (2 * terms[2], part.acceleration), (6 * terms[3], None)
         )
-        return where(x <= at, jnp.abs(horner(velocity, x)), 0.0), (x > at) | (is_found(x, last, 1e-4) & (x > 0))
+        return select(x <= at, jnp.abs(horner(velocity, x)), 0.0), (x > at) | (is_found(x, last, 1e-4) & (x > 0))
 
     return _if(part.has_extremum & (jnp.abs(part.bound) > known), extremum, (zero, jnp.ones_like(part.has_extremum)))
 
@@ -241,27 +237,27 @@ def advance(stepper: TaylorStepper, state: State) -> State:
     shaking, unit = stepper.shaking(state.piece, state.local)
     start = stepper.start(state, shaking, unit)
     stretch, one = start.stretch, start.one
-    terms = expand(start, order).opening
+    terms = taylor_expansion(start, order).opening
     size = functools.reduce(jnp.maximum, [jnp.abs(c) for c in terms[: max(order // 2, 4)]])
-    least = stepper.tolerance * keep_by(jnp.minimum(scene.alpha, size), one)
+    least = stepper.tolerance * materialize_by(jnp.minimum(scene.alpha, size), one)
     part = _part(start, terms, jnp.minimum(stepper.room(state) * (1 / unit), 32.0), least, stepper.longest)
     meeting = _meeting(start, terms, part, state)
     at, hits = meeting.at, meeting.hits
     fast, sure = _fastest(start, terms, part, at, state.fastest * stretch)
-    certain = keep_flag(meeting.certain & sure & _stands(stepper, meeting), state.local)
+    certain = materialize_flag(meeting.certain & sure & _stands(stepper, meeting), state.local)
 
     opening, _ = landed(scene, hits, meeting.opening, meeting.speed)
-    velocity = keep_by(meeting.speed * (1 / stretch), one)
-    elapsed = keep_by(at * unit, one)
+    velocity = materialize_by(meeting.speed * (1 / stretch), one)
+    elapsed = materialize_by(at * unit, one)
     full = part.full & ~(hits.saddle | hits.impact | hits.turning)
     piece, local, over = stepper.move_on(state, elapsed, full)
-    time = where(at > 0, at * stretch, jnp.inf)  # some pieces have zero length
+    time = select(at > 0, at * stretch, jnp.inf)  # some pieces have zero length
     missed = _missed(stepper, terms, at, least)
     errors = 2 * missed, 2 * missed * jnp.maximum(order / time, 1.0)
     spread = errors_after(stepper, state, start.angle, shaking.now, elapsed, errors)
     passed = replace(
         state,
-        spread=jax.tree.map(lambda x: keep_by(x, one), spread),
+        spread=jax.tree.map(lambda x: materialize_by(x, one), spread),
         local=state.local + meeting.turn_at * unit,  # at the turning point, for `note`
         opening=opening,
         velocity=velocity,
@@ -272,15 +268,15 @@ def advance(stepper: TaylorStepper, state: State) -> State:
     )
 
     def noted_now():
-        return note(
+        return record_extrema(
             stepper,
             passed,
             part.outward > 0,
             meeting.turned & ~hits.saddle,
             hits.saddle,
-            where(hits.saddle, scene.moments.saddle, meeting.top),
-            where(hits.saddle, velocity, 0.0),
-            keep_by(where(hits.saddle, meeting.acceleration, meeting.top_acceleration) / stretch**2, one),
+            select(hits.saddle, scene.moments.saddle, meeting.top),
+            select(hits.saddle, velocity, 0.0),
+            materialize_by(select(hits.saddle, meeting.acceleration, meeting.top_acceleration) / stretch**2, one),
         )
 
     noted = replace(_if(meeting.turned | hits.saddle, noted_now, passed), piece=piece, local=local)
@@ -298,10 +294,10 @@ def advance(stepper: TaylorStepper, state: State) -> State:
         done=struck.done | lost | ~certain,
         status=Status.where(postponed, Status.undecided, struck.status),
     )
-    return checked(stepper, state, after)
+    return checked_step(stepper, state, after)
 
 
-def wait(stepper: TaylorStepper, state: State) -> State:
+def certain_wait(stepper: TaylorStepper, state: State) -> State:
     """Advance a lane at rest to where the drive exceeds the threshold, or as far as it certainly does not."""
     scene, order = stepper.scene, stepper.order
     shaking, unit = stepper.shaking(state.piece, state.local)
@@ -312,7 +308,7 @@ def wait(stepper: TaylorStepper, state: State) -> State:
     for drive, _ in drives if shaking.vertical is not None else drives[:1]:
         share = jnp.minimum(share, _monotone(drive, length))
     full = (length >= room * (1 - 1e-9)) & (share == 1)
-    length = keep(share * length, state.local)
+    length = materialize(share * length, state.local)
     lasting = room > 0  # in a zero-length piece nothing happens
 
     def of(drive, level):
@@ -326,17 +322,17 @@ def wait(stepper: TaylorStepper, state: State) -> State:
     (drive, level), (drive2, level2) = drives
     (lifts, touching, meets, end), (lifts2, touching2, meets2, end2) = of(drive, level), of(drive2, level2)
     second = lifts2 | meets2
-    missing = [where(second, b, a) for a, b in zip(drive, drive2)]
-    missing[0] = where(second, drive2[0] - level2, drive[0] - level)
+    missing = [select(second, b, a) for a, b in zip(drive, drive2)]
+    missing[0] = select(second, drive2[0] - level2, drive[0] - level)
     slope = missing[1] if len(missing) > 1 else jnp.zeros_like(length)
-    ending = where(second, end2 - level2, end - level)
+    ending = select(second, end2 - level2, end - level)
     x, last = root_between(_MEET, missing, jnp.zeros_like(length), length, (missing[0], ending), (slope, None))
     both = (lifts | meets) & second
     lifts, touching, meets = lifts | lifts2, touching | touching2, meets | meets2
-    elapsed = where(lifts, 0.0, where(meets, x, length)) * unit
+    elapsed = select(lifts, 0.0, select(meets, x, length)) * unit
     full = full & ~meets & ~lifts
     piece, local, over = stepper.move_on(state, elapsed, full)
-    piece = where(full & ~over, scene.after_quiet(piece), piece)
+    piece = select(full & ~over, scene.after_quiet(piece), piece)
     never = scene.outlook.is_over(state.piece)
     unclear = ~never & ((share == 0) | touching | both | (meets & ~lifts & ~is_found(x, last)))
     rested = replace(
@@ -347,7 +343,7 @@ def wait(stepper: TaylorStepper, state: State) -> State:
         steps=state.steps + 1,
         status=Status.where(unclear, Status.undecided, state.status),
     )
-    side = where(second, -1.0, 1.0)
+    side = select(second, -1.0, 1.0)
     return lift(rested, side, (lifts | meets) & ~unclear & ~never, meets & ~lifts, lifts)
 
 
@@ -357,6 +353,6 @@ def _monotone(terms: list[Scalar], length: Scalar) -> Scalar:
     rises = first_sign(slope[0], slope[1] if len(slope) > 1 else jnp.ones_like(length))
     share = jnp.zeros_like(length)
     for part in (*reversed(POLICY.shorter), 1.0):
-        share = where(keeps_sign(slope, rises, part * length) > 0, part, share)
+        share = select(keeps_sign(slope, rises, part * length) > 0, part, share)
     steady = horner([jnp.abs(c) for c in slope], length) * length == 0  # or zero length
-    return where(steady, 1.0, share)
+    return select(steady, 1.0, share)

@@ -11,20 +11,18 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Inexact, Int
+from jaxtyping import Array, Int
 
+from jaxrock._core.types import Scalar
+from jaxrock._core.unit_tangents import AT_ONCE, in_rows, unit_tangents
+from jaxrock.compiler import custom_tangent, lane_function
+from jaxrock.compiler.hints import stop_gradient
 from jaxrock.engines.scene import Here
 from jaxrock.engines.state import State
 from jaxrock.engines.trajectory import rows_of, states_of
 from jaxrock.motions.shaking import Shaking
-from jaxrock.numerics.fixed import fixed
-from jaxrock.numerics.given import given, is_zero
-from jaxrock.transforms.differentiation import differentiable
-from jaxrock.transforms.forward_mode import directions_of, in_rows
-from jaxrock.transforms.scenes import AT_ONCE
 
-Scalar = Inexact[Array, ""]
-Stepper = Any  # a `TaylorStepper`, whose module imports this one
+_Stepper = Any  # a `TaylorStepper`, whose module imports this one
 _TOGETHER = 256  # steps whose Jacobians are computed at once
 _PATH = ("local", "opening", "velocity")  # the state variables of a step
 # A step keeps each recorded extremum, or computes it from the path. Two of them may instead take the previous value of
@@ -44,7 +42,7 @@ class _Ground(NamedTuple):
     length: Scalar
 
     @classmethod
-    def of(cls, stepper: Stepper, piece: Int[Array, ""], local: Scalar) -> "_Ground":
+    def of(cls, stepper: _Stepper, piece: Int[Array, ""], local: Scalar) -> "_Ground":
         """Evaluate the motion at this time."""
         shaking, unit = stepper.shaking(piece, local)
         return cls(shaking, unit, stepper.scene.start(piece), stepper.scene.length(piece))
@@ -62,12 +60,12 @@ class _Numbers(NamedTuple):
     stop: Scalar | None
 
     @classmethod
-    def of(cls, stepper: Stepper) -> "_Numbers":
+    def of(cls, stepper: _Stepper) -> "_Numbers":
         """Collect the inputs of a scene."""
         scene = stepper.scene
         return cls(scene.moments, scene.far, scene.p, scene.alpha, scene.reset, scene.far_reset, stepper.stop)
 
-    def put_into(self, stepper: Stepper, here: Here) -> Stepper:
+    def put_into(self, stepper: _Stepper, here: Here) -> _Stepper:
         """Return the stepper with these inputs, and with one piece of the motion."""
         numbers = self._asdict()
         stop = numbers.pop("stop")
@@ -86,7 +84,7 @@ class _Slopes(NamedTuple):
     passed: list
 
 
-def end_on_tape(stepper: Stepper, state: State) -> State:
+def end_on_tape(stepper: _Stepper, state: State) -> State:
     """Follow a block, and return the last state, as `on_tape`.
 
     An outcome may take many more steps than a history: memory for all would cost most blocks ten times the time of
@@ -104,17 +102,17 @@ def end_on_tape(stepper: Stepper, state: State) -> State:
     return jax.lax.scan(further, state, jnp.minimum(usual * (1 + jnp.arange(-(-most // usual))), most))[0]
 
 
-def on_tape(stepper: Stepper, state: State, room: int, limit: Int[Array, ""] | None = None) -> tuple[State, State]:
+def on_tape(stepper: _Stepper, state: State, room: int, limit: Int[Array, ""] | None = None) -> tuple[State, State]:
     """Follow a block: return the last state, and those before every step, as `states_of`.
 
     Reverse mode differentiates them by very many numbers through products.
     """
-    still, start = fixed((replace(stepper, taped=False), state))
+    still, start = stop_gradient((replace(stepper, taped=False), state))
     stretches = -(-room // _TOGETHER)
-    last, nodes = fixed(states_of(still, start, stretches * _TOGETHER, room if limit is None else limit))
+    last, nodes = stop_gradient(states_of(still, start, stretches * _TOGETHER, room if limit is None else limit))
     ground = jax.vmap(lambda piece, local: _Ground.of(stepper, piece, local))(nodes.piece, nodes.local)
     by = _reals(state), (_Numbers.of(stepper), ground), still, nodes, last.steps - start.steps
-    ends, starts = given(_changes, (_reals(last), _reals(nodes)), by)
+    ends, starts = custom_tangent(_changes, (_reals(last), _reals(nodes)), by)
     rows = rows_of(stepper.engine, room)  # no more than without a tape
     return _with_reals(last, ends), jax.tree.map(lambda x: x[:rows], _with_reals(nodes, starts))
 
@@ -130,8 +128,8 @@ def _with_reals(states: State, reals: list) -> State:
 def _changes(values: tuple, by: tuple, changes: tuple) -> tuple[list, list]:
     """Return the tangents of the last state, and of those before every step: products with the Jacobians of the
     steps."""
-    (_, reals), (_, told, still, nodes, steps), (first, d_told, *_) = values, by, changes
-    first = jnp.stack([jnp.zeros(d.aval.shape, d.aval.dtype) if is_zero(d) else d for d in first])
+    (_, reals), (path, told, still, nodes, steps), (first, d_told, *_) = values, by, changes
+    first = jnp.stack([jnp.zeros_like(x) if d is None else d for x, d in zip(path, first)])
     numbers, by_numbers = _parted(told[0], d_told[0], jnp.zeros(0, first.dtype))
     ground, by_ground = _parted(told[1], d_told[1], jnp.zeros((nodes.steps.size, 0), first.dtype))
     nodes = _with_reals(nodes, reals)
@@ -160,9 +158,9 @@ def _changes(values: tuple, by: tuple, changes: tuple) -> tuple[list, list]:
 
 def _parted(told: Any, changes: Any, none: Array) -> tuple[tuple, Array]:
     """Partition the inputs into those with tangents and the rest; flatten the tangents behind `none`."""
-    moving = jax.tree.map(lambda x, d: None if is_zero(d) else x, told, changes)
-    rest = jax.tree.map(lambda x, d: x if is_zero(d) else None, told, changes)
-    known = [d for d in jax.tree.leaves(changes, is_leaf=is_zero) if not is_zero(d)]
+    moving = jax.tree.map(lambda x, d: None if d is None else x, told, changes)
+    rest = jax.tree.map(lambda x, d: x if d is None else None, told, changes)
+    known = jax.tree.leaves(changes)
     return (moving, rest), jnp.concatenate([none, *(d.reshape(*none.shape[:-1], -1) for d in known)], axis=-1)
 
 
@@ -176,7 +174,9 @@ def _one(change: Array, step: tuple) -> tuple[Array, Array]:
     return jnp.where(going, after, change), change
 
 
-def _products(still: Stepper, node: State, numbers: tuple, ground: tuple, by_numbers: Array, by_ground: Array) -> tuple:
+def _products(
+    still: _Stepper, node: State, numbers: tuple, ground: tuple, by_numbers: Array, by_ground: Array
+) -> tuple:
     """Return, for a step, the Jacobian by the path, the factors of the extrema, and the tangent from all other inputs.
 
     Factors are those by the extremum itself, and by the first ones. `numbers`, `ground`: the inputs with tangents, and
@@ -184,8 +184,8 @@ def _products(still: Stepper, node: State, numbers: tuple, ground: tuple, by_num
     """
     moving, rest = zip(numbers, ground)
     leaves = [*_path_of(node), *jax.tree.leaves(moving)]
-    slopes = differentiable(_slopes, name="slopes of a step", in_lanes=True, derivatives="by directions")
-    rows = in_rows(directions_of(leaves), AT_ONCE)
+    slopes = lane_function(_slopes, key="slopes of a step", in_lanes=True, mode="jacobian by columns")
+    rows = in_rows(unit_tangents(leaves), AT_ONCE)
     found, kept, passed = jax.vmap(lambda *row: slopes((still, rest, moving, node, row)))(*rows)
     columns = jnp.stack(found).reshape(len(found), -1)[:, : sum(x.size for x in leaves)]
     by_path, by_told = columns[:, : len(_PATH)], columns[:, len(_PATH) :]
@@ -196,7 +196,7 @@ def _products(still: Stepper, node: State, numbers: tuple, ground: tuple, by_num
 def _slopes(given_: tuple) -> _Slopes:
     """Differentiate a step in directions of its path and of all inputs with tangents."""
     stepper, rest, moving, node, directions = given_
-    local = fixed(node.local)
+    local = stop_gradient(node.local)
     leaves, structure = jax.tree.flatten(moving)
     path, seen = _path_of(node), [getattr(node, name) for name in _SEEN]
 

@@ -2,16 +2,15 @@
 
 import re
 
-from jaxrock._text import check_end, file_error
-from jaxrock.motions.files.format import AbstractFormat, Accelerogram
+from jaxrock._core.text import check_end, file_error
+from jaxrock.motions.files.format import AbstractFormat, Accelerogram, no_acceleration
+from jaxrock.motions.files.headers import agreed_step, agreed_unit, no_column
 from jaxrock.motions.files.parsing import (
     NUMBER,
-    agreed_step,
-    agreed_unit,
     announced_samples,
+    free_numbers,
     is_unit,
-    no_column,
-    plain_numbers,
+    printed_numbers,
     to_float,
     unit_named,
 )
@@ -27,11 +26,6 @@ _COUNT = re.compile(r"(?<![A-Z])NPTS\s*=?\s*(\d+)", re.IGNORECASE)
 _STEP = re.compile(rf"(?<![A-Z])DT\s*=?\s*({NUMBER})\s*([A-Zµμ]*)", re.IGNORECASE)
 _RATE = re.compile(rf"(?<![A-Z])DT\s*=?\s*{NUMBER}\s*(K?HZ|SPS|SAMPLES|POINTS|PTS|1/S)", re.IGNORECASE)
 _BEFORE = re.compile(rf"^\s*(\d+)[\s,]+({NUMBER})[\s,]+NPTS[\s,]+DT\b", re.IGNORECASE)
-
-_MANY = 50  # lines from which the printed digits are read
-
-# Printed numbers may touch, but only a sign marks the next: 1.234562.34567 is refused.
-_NUMBERS = re.compile(rf"\s*{NUMBER}(?:(?:\s+|(?=[-+])){NUMBER})*\s*")
 
 
 class AT2(AbstractFormat):
@@ -60,8 +54,8 @@ class AT2(AbstractFormat):
         dt = agreed_step(name, dt, step)
         at, written = _unit_of(name, lines[: last + 1])
         unit = agreed_unit(name, (at or 0) + 1, unit, written)
-        samples = announced_samples(name, lines, last + 1, count, _numbers, plain_numbers)
-        check_end(name, lines, _printed(lines[last + 1 :]), by_program=True)
+        samples = announced_samples(name, lines, last + 1, count, free_numbers)
+        check_end(name, lines, printed_numbers(lines[last + 1 :]), by_program=True)
         # Event, station and component stand above the unit; the first line only names the database.
         title = " ".join(lines[at - 1].split()) if at is not None and at >= 2 else ""
         return Accelerogram(samples, dt, unit, title, _origin(title))
@@ -74,7 +68,7 @@ def _check_kind(name: str, header: list[str]) -> None:
     for number, line in enumerate(header, 1):
         kind, rate = _OTHER_KIND.search(line), _RATE.search(line)
         if kind:
-            raise file_error(name, f"line {number} states {kind[1].lower()}, but samples must be accelerations.")
+            raise no_acceleration(name, number, kind[1])
         if rate:
             raise file_error(name, f"line {number} states DT in {rate[1]!r}, but it must be a time step.")
 
@@ -126,17 +120,3 @@ def _counts(line: str) -> tuple[int, float] | None:
 def _steps(line: str) -> list[float]:
     """Return all time steps that a line states [s]."""
     return [to_float(number) * SECONDS.get(unit.lower(), 1.0) for number, unit in _STEP.findall(line)]
-
-
-def _printed(lines: list[str]) -> list[str]:
-    """Return numbers as they are printed: many of the first, and the last."""
-    samples = [line for line in lines if line.strip() and _NUMBERS.fullmatch(line)]
-    samples = samples[:_MANY] + samples[max(_MANY, len(samples) - 2) :]
-    return [text for line in samples for text in re.findall(NUMBER, line)]
-
-
-def _numbers(line: str) -> list[float] | None:
-    """Return the numbers in a line, or None if it holds anything else; they may touch before a sign."""
-    if not _NUMBERS.fullmatch(line):
-        return None
-    return [to_float(text) for text in re.findall(NUMBER, line)]

@@ -6,10 +6,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from jaxrock._precision import frames_of_the_package
-from jaxrock._text import check_end, file_error
+from jaxrock._core.precision import frames_of_the_package
+from jaxrock._core.text import check_end, file_error, line_error
 from jaxrock.motions.files.format import AbstractFormat, Accelerogram
-from jaxrock.motions.files.parsing import LIKE_DATA, NUMBER, agreed_step, agreed_unit, to_float
+from jaxrock.motions.files.headers import agreed_step, agreed_unit
+from jaxrock.motions.files.parsing import LIKE_DATA, NUMBER, to_float
 from jaxrock.motions.files.titles import Titles, titles_of
 from jaxrock.motions.record import Origin
 
@@ -119,8 +120,7 @@ def _check_commas(name: str, lines: list[str], table: np.ndarray, numbers: Seque
         return
     rising = len(table) > 1 and (np.diff(table[:, 0]) > 0).all()
     if not rising and all(_ONE_COMMA.fullmatch(lines[number - 1].split("#")[0]) for number in numbers):
-        text = lines[numbers[0] - 1].strip()
-        raise file_error(name, f"line {numbers[0]} holds decimal commas, which must be points: {text[:60]!r}.")
+        raise line_error(name, numbers[0], "holds decimal commas, which must be points:", lines[numbers[0] - 1])
 
 
 def _fields(line: str) -> list[str]:
@@ -144,12 +144,12 @@ def _table(name: str, lines: list[str]) -> tuple[np.ndarray, Sequence[int], list
             continue
         if not all(_FIELD.fullmatch(field) for field in fields):
             if rows:
-                raise file_error(name, f"line {number} should hold numbers only, but is {line[:60]!r}.")
+                raise line_error(name, number, "should hold numbers only, but is", line)
             _check_header(name, number, line)
             continue
         row = [to_float(field) if field[-1].isdigit() or field[-1] == "." else np.nan for field in fields]
         if not np.isfinite(row).all():
-            raise file_error(name, f"line {number} holds a number that is not finite: {line[:60]!r}.")
+            raise line_error(name, number, "holds a number that is not finite:", line)
         if rows and len(row) != len(rows[0]):
             columns = "columns" if len(row) > 1 else "column"
             raise file_error(name, f"line {number} has {len(row)} {columns}, but line {numbers[0]} has {len(rows[0])}.")
@@ -165,10 +165,10 @@ def _table(name: str, lines: list[str]) -> tuple[np.ndarray, Sequence[int], list
 def _check_header(name: str, number: int, line: str) -> None:
     """Refuse a header line that looks like numbers."""
     if _DECIMAL_COMMAS.fullmatch(line):
-        raise file_error(name, f"line {number} holds decimal commas, which must be points: {line[:60]!r}.")
+        raise line_error(name, number, "holds decimal commas, which must be points:", line)
     if LIKE_DATA.match(line):
         hint = "if it belongs to a header, let it start with #"
-        raise file_error(name, f"line {number} holds more than numbers ({hint}): {line[:60]!r}.")
+        raise line_error(name, number, f"holds more than numbers ({hint}):", line)
 
 
 _MARKS = re.compile(r"[^-+.0-9EeDd \t\n,]")

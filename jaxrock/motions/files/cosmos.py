@@ -2,16 +2,10 @@
 
 import re
 
-from jaxrock._text import check_end, file_error
-from jaxrock.motions.files.csmip import chosen_channel
-from jaxrock.motions.files.format import AbstractFormat, Accelerogram
-from jaxrock.motions.files.parsing import (
-    agreed_step,
-    agreed_unit,
-    announced_columns,
-    check_peak,
-    fixed_numbers,
-)
+from jaxrock._core.text import check_end, file_error, line_error
+from jaxrock.motions.files.format import AbstractFormat, Accelerogram, no_acceleration
+from jaxrock.motions.files.headers import agreed_step, agreed_unit, chosen_channel, first_match, places_of, text_after
+from jaxrock.motions.files.parsing import announced_columns, check_peak, fixed_numbers
 from jaxrock.motions.record import Origin
 
 # "   42000 acceleration pts, approx  210 secs, units=cm/sec2(04),Format=(1E15.6)"
@@ -56,7 +50,7 @@ class COSMOS(AbstractFormat):
         lines = lines[:end]
         count, what, seconds, written, per_line, width = _DATA.match(lines[at]).groups()
         if not _ACCELERATION.match(what):
-            raise file_error(name, f"line {at + 1} announces {what.lower()}, but samples must be accelerations.")
+            raise no_acceleration(name, at + 1, what, "announces")
         unit = agreed_unit(name, at + 1, unit, written)
         reals = _reals(name, lines, start)
         step = reals[_STEP] / 1000
@@ -70,14 +64,12 @@ class COSMOS(AbstractFormat):
             check_end(name, lines, [line[-width:] for line in lines[at + 1 :] if line.strip()], by_program=True)
         if unit == "cm/s2" and reals[_PEAK] != _UNKNOWN:
             check_peak(name, at + 1, reals[_PEAK], samples, "the header")
-        origin = _origin(lines[start:at])
-        title = ", ".join(filter(None, (origin.event, origin.station, origin.component)))
-        return Accelerogram(samples, agreed_step(name, dt, step), unit, title, origin)
+        return Accelerogram.named(samples, agreed_step(name, dt, step), unit, _origin(lines[start:at]))
 
 
 def _records(lines: list[str]) -> list[tuple[int, int, int]]:
     """Return the begin, data line and end of each record of accelerations, or of all records where there are none."""
-    starts = [number for number, line in enumerate(lines) if _FIRST.match(line)]
+    starts = places_of(_FIRST, lines)
     found = {number: said[2] for number, line in enumerate(lines) if (said := _DATA.match(line))}
     chosen = [number for number, what in found.items() if _ACCELERATION.match(what)] or list(found)
     begins = [max((start for start in starts if start < at), default=0) for at in chosen]
@@ -87,39 +79,31 @@ def _records(lines: list[str]) -> list[tuple[int, int, int]]:
 
 def _reals(name: str, lines: list[str], start: int) -> list[float]:
     """Return the real header of the record that begins at a line."""
-    numbered = enumerate(lines[start:], start)
-    at, found = next(((n, found) for n, line in numbered if (found := _REALS.match(line))), (0, None))
+    found = first_match(_REALS, lines[start:], start)
     if found is None:
         raise file_error(name, "no line announces 'Real-header values', as a COSMOS file must.")
-    count, width = map(int, found.groups())
+    at, (count, width) = found[0], map(int, found[1].groups())
     values = []
-    for number, line in enumerate(lines[at + 1 :], at + 2):
+    for number, line in enumerate(lines[at:], at + 1):
         if len(values) >= count:
             break
         row = fixed_numbers(line, width)
         if row is None:
-            raise file_error(
-                name, f"line {number} should hold values of the real header, but is {line.strip()[:60]!r}."
-            )
+            raise line_error(name, number, "should hold values of the real header, but is", line)
         values += row
     if len(values) != count or count <= _PEAK:
-        raise file_error(name, f"line {at + 1} announces {count} values of a header, but {len(values)} follow.")
+        raise file_error(name, f"line {at} announces {count} values of a header, but {len(values)} follow.")
     return values
 
 
 def _origin(lines: list[str]) -> Origin:
     """Return the origin from the text header, whose entries have fixed places."""
-
-    def after(pattern: str) -> str:
-        found = next((m for line in lines for m in [re.search(pattern, line, re.IGNORECASE)] if m), None)
-        return " ".join(found[1].split()) if found else ""
-
-    code = after(r"Code:\s*(\S+)")
-    station = re.sub(r"^\S+\s+", "", after(r"Code:\s*\S+\s+(.*)")) or code
-    event = re.sub(r"\s+of\s+\w{3}\s+\w{3}\s+\d+,.*$", "", after(r"^\s*Record of\s+(.*)"))
-    component = after(r"Sta Chan\s+\S*?:\s*(.*?)\s*(?:\(|$)")
-    channel = after(r"<SCNL>\s*(\S+)")
+    code = text_after(r"Code:\s*(\S+)", lines)
+    station = re.sub(r"^\S+\s+", "", text_after(r"Code:\s*\S+\s+(.*)", lines)) or code
+    event = re.sub(r"\s+of\s+\w{3}\s+\w{3}\s+\d+,.*$", "", text_after(r"^\s*Record of\s+(.*)", lines))
+    component = text_after(r"Sta Chan\s+\S*?:\s*(.*?)\s*(?:\(|$)", lines)
+    channel = text_after(r"<SCNL>\s*(\S+)", lines)
     if component.lower() in ("", "other") and channel.count(".") >= 1:
         component = channel.split(".")[1]
-    start = after(r"Rcrd start time:\s*([\d/]+,?\s+[\d:.]+)").replace(",", "")
+    start = text_after(r"Rcrd start time:\s*([\d/]+,?\s+[\d:.]+)", lines).replace(",", "")
     return Origin(event, station, component, start, code)

@@ -7,17 +7,10 @@ import re
 
 import numpy as np
 
-from jaxrock._text import check_end, file_error
+from jaxrock._core.text import check_end, file_error
 from jaxrock.motions.files.format import AbstractFormat, Accelerogram
-from jaxrock.motions.files.parsing import (
-    NUMBER,
-    agreed_step,
-    agreed_unit,
-    announced_columns,
-    check_peak,
-    fixed_numbers,
-    to_float,
-)
+from jaxrock.motions.files.headers import agreed_step, agreed_unit, chosen_channel, places_of, text_after
+from jaxrock.motions.files.parsing import NUMBER, announced_columns, check_peak, fields_of, fixed_numbers, to_float
 from jaxrock.motions.record import Origin
 
 # "5690 POINTS OF ACCEL DATA EQUALLY SPACED AT  .010 SEC.  (UNITS: CM/SEC/SEC)"; later files write
@@ -42,7 +35,7 @@ class CSMIP(AbstractFormat):
         return any(map(_CHANNEL.match, lines)) or any(map(_SPECTRA.match, lines[:1]))
 
     def read(self, name, lines, dt, unit, column):
-        channels = [number for number, line in enumerate(lines) if _CHANNEL.match(line)]
+        channels = places_of(_CHANNEL, lines)
         if not channels:
             if _SPECTRA.match(lines[0]):
                 said = "take its V2 file, or `jaxrock.motions.read_spectra`"
@@ -62,23 +55,13 @@ class CSMIP(AbstractFormat):
         return Accelerogram(samples, dt, unit, *told(lines[:at], r"\s*CORRECTED ACCELEROGRAM", (2, 6, 7)))
 
 
-def chosen_channel(name: str, kind: str, column: int | None, count: int) -> int:
-    """Return the channel that is asked for, in a file with `count` channels; None asks for the first."""
-    channel = 0 if column is None else column
-    if channel >= count:
-        allowed = f"be 0 to {count - 1}, a channel of {kind} file `{name}`"
-        raise ValueError(f"Argument `column` must {allowed}, but is {channel}.")
-    return channel
-
-
 def check_last_columns(name: str, lines: list[str], start: int, width: int) -> None:
     """Check that the last line of a channel, at which a file may end, is whole."""
     rows = [
         row for row, line in enumerate(lines[start:], start) if line.strip() and fixed_numbers(line, width) is not None
     ]
     if lines[-1].strip() and rows and rows[-1] == len(lines) - 1:
-        last = lines[-1].rstrip()
-        check_end(name, lines, [last[k : k + width] for k in range(0, len(last), width)])
+        check_end(name, lines, fields_of(lines[-1], width))
 
 
 _PEAK = re.compile(rf"\s*PEAK\s+ACCELERATION\s*=\s*({NUMBER})\s*CM/SEC/SEC", re.IGNORECASE)
@@ -101,14 +84,13 @@ def told(lines: list[str], first: str, places: tuple[int, int, int]) -> tuple[st
 
     `first`: pattern of the first line of a channel's text header; `places` of the three in it, counted in lines.
     """
-    starts = [row for row, line in enumerate(lines) if re.match(first, line, re.IGNORECASE)]
+    starts = places_of(re.compile(first, re.IGNORECASE), lines)
     header = lines[starts[-1] :] if starts else []
     parts = [re.split(r"(?<![:\s])\s{3,}|\s{2,}\(", header[row].strip())[0] for row in places if row < len(header)]
     parts = [" ".join(part.split()) for part in parts]
     event, station, channel = (*parts, "", "", "")[:3]
-    text = "\n".join(header[:10])
-    start = re.search(r"(?:TRIGGER|START) TIME:\s*(.*)", text, re.IGNORECASE)
-    code = re.search(r"STATION (?:NO\.?|ID\.)\s*(\S+)", text, re.IGNORECASE)
+    text = ["\n".join(header[:10])]
+    start = text_after(r"(?:TRIGGER|START) TIME:\s*(.*)", text)
+    code = text_after(r"STATION (?:NO\.?|ID\.)\s*(\S+)", text)
     component = _BEFORE_COMPONENT.sub("", channel)
-    words = (" ".join(found[1].split()) if found else "" for found in (start, code))
-    return ", ".join(filter(None, parts)), Origin(event, station, component, *words)
+    return ", ".join(filter(None, parts)), Origin(event, station, component, start, code)

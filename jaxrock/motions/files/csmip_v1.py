@@ -5,18 +5,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxrock._text import file_error
-from jaxrock.motions.files.csmip import check_last_columns, chosen_channel, told
+from jaxrock._core.text import file_error
+from jaxrock.motions.files.csmip import check_last_columns, told
 from jaxrock.motions.files.format import AbstractFormat, Accelerogram
-from jaxrock.motions.files.parsing import (
-    NUMBER,
-    agreed_step,
-    agreed_unit,
-    announced_columns,
-    check_peak,
-    fixed_numbers,
-    to_float,
-)
+from jaxrock.motions.files.headers import agreed_step, agreed_unit, chosen_channel, first_match, places_of
+from jaxrock.motions.files.parsing import NUMBER, announced_columns, check_peak, fixed_numbers, to_float
 
 _FIRST = re.compile(r"^\s*UNCORRECTED ACCELEROGRAM DATA\b", re.IGNORECASE)
 # " 13200 Accelerogram points at 200 pts/sec in units of g .      Format: (8f9.6)"
@@ -44,7 +37,7 @@ class CSMIPUncorrected(AbstractFormat):
         return bool(lines) and bool(_FIRST.match(lines[0]))
 
     def read(self, name, lines, dt, unit, column):
-        starts = [number for number, line in enumerate(lines) if _FIRST.match(line)]
+        starts = places_of(_FIRST, lines)
         if not starts:
             raise file_error(name, "no line begins with 'Uncorrected accelerogram data', as a V1 file must.")
         channel = chosen_channel(name, "V1", column, len(starts))
@@ -89,17 +82,15 @@ def _samples(name: str, lines: list[str], at: int) -> _Block:
 def _pairs(name: str, lines: list[str], at: int) -> _Block:
     """Return times and samples, which follow three headers."""
     header, start = lines[at : at + _TEXT], at + _TEXT + _WHOLE + _REAL
-    found = [next(((at + row + 1, m[1]) for row, line in enumerate(header) if (m := pattern.search(line))), None)
-             for pattern in (_COUNT, _UNIT)]  # fmt: skip
-    points, units = found
+    points, units = first_match(_COUNT, header, at), first_match(_UNIT, header, at)
     if points is None or units is None:
         raise file_error(name, "header must state 'No. of points' and 'Units ... are sec and', as that of a V1 file.")
     (_, count), (line, unit) = points, units
     wholes, reals = lines[at + _TEXT : start - _REAL], lines[start - _REAL : start]
     if not all(re.fullmatch(r"[\s\d-]+", row) for row in wholes) or None in (fixed_numbers(row, 10) for row in reals):
         raise file_error(name, f"lines {at + _TEXT + 1} to {start} should hold the numbers of a V1 file's headers.")
-    values = announced_columns(name, lines, start, 2 * int(count), _PAIR, "times and samples")
-    return _Block(values[1::2], unit, line, start, _PAIR, times=values[::2])
+    values = announced_columns(name, lines, start, 2 * int(count[1]), _PAIR, "times and samples")
+    return _Block(values[1::2], unit[1], line, start, _PAIR, times=values[::2])
 
 
 def _even(name: str, dt: float | None, times: np.ndarray, samples: np.ndarray) -> tuple[float, np.ndarray]:

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import numpy as np
 
-from jaxrock._arguments import arguments, word_of
+from jaxrock._arguments.annotations import arguments, word_of
 from jaxrock.motions.components import Components
 from jaxrock.motions.record import Origin, Record
 

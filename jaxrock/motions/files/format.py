@@ -6,6 +6,7 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from jaxrock._core.text import file_error
 from jaxrock.motions.record import Origin
 
 
@@ -20,6 +21,16 @@ class Accelerogram(NamedTuple):
     unit: str
     title: str
     origin: Origin = Origin()
+
+    @classmethod
+    def named(cls, samples: np.ndarray, dt: float, unit: str, origin: Origin) -> "Accelerogram":
+        """Return an accelerogram whose title is its event, station and component."""
+        return cls(samples, dt, unit, ", ".join(filter(None, origin[:3])), origin)
+
+
+def no_acceleration(name: str, line: int, kind: str, verb: str = "states") -> ValueError:
+    """Return what to raise for a file of another quantity."""
+    return file_error(name, f"line {line} {verb} {kind.lower()}, but samples must be accelerations.")
 
 
 class AbstractFormat(abc.ABC):

@@ -3,17 +3,10 @@
 import re
 from datetime import datetime, timedelta
 
-from jaxrock._text import check_end, file_error
+from jaxrock._core.text import check_end, file_error
 from jaxrock.motions.files.format import AbstractFormat, Accelerogram
-from jaxrock.motions.files.parsing import (
-    NUMBER,
-    agreed_step,
-    agreed_unit,
-    announced_samples,
-    check_peak,
-    no_column,
-    plain_numbers,
-)
+from jaxrock.motions.files.headers import Header, agreed_step, agreed_unit, no_column, stated_numbers, value_of
+from jaxrock.motions.files.parsing import NUMBER, announced_samples, check_peak, printed_numbers
 from jaxrock.motions.record import Origin
 
 _KEYS = (
@@ -40,32 +33,28 @@ class KNET(AbstractFormat):
     def read(self, name, lines, dt, unit, column):
         no_column(name, column, "K-NET")
         header = _header(lines)
-        rate = _stated(name, header, "Sampling Freq(Hz)", rf"({NUMBER})\s*Hz")[0]
-        duration = _stated(name, header, "Duration Time(s)", rf"({NUMBER})")[0]
-        gal, counts = _stated(name, header, "Scale Factor", rf"({NUMBER})\s*\(gal\)\s*/\s*({NUMBER})")
+        (rate,) = stated_numbers(name, header, "Sampling Freq(Hz)", rf"({NUMBER})\s*Hz")
+        (duration,) = stated_numbers(name, header, "Duration Time(s)")
+        gal, counts = stated_numbers(name, header, "Scale Factor", rf"({NUMBER})\s*\(gal\)\s*/\s*({NUMBER})")
         if not (rate > 0 and duration > 0 and gal > 0 and counts > 0):
             raise file_error(name, "header must state a positive frequency, duration and scale factor.")
         unit = agreed_unit(name, header["Scale Factor"][0], unit, "gal")
         start = max(line for line, _ in header.values())
-        samples = announced_samples(name, lines, start, round(rate * duration), _counts, plain_numbers)
-        check_end(name, lines, [word for line in (*lines[start : start + 50], *lines[-3:]) for word in line.split()])
+        samples = announced_samples(name, lines, start, round(rate * duration), _counts)
+        check_end(name, lines, printed_numbers(lines[start:]))
         samples = (samples - samples.mean()) * (gal / counts)
         if "Max. Acc. (gal)" in header:
-            line, value = header["Max. Acc. (gal)"]
-            _stated(name, header, "Max. Acc. (gal)", rf"({NUMBER})")
-            check_peak(name, line, value, samples)
-        told = {key: value for key, (_, value) in header.items()}
-        component = _CHANNELS.get(told.get("Dir.", ""), told.get("Dir.", ""))
-        event = " ".join(filter(None, (told.get("Origin Time"), told.get("Mag.") and "M" + told["Mag."])))
-        code = told.get("Station Code", "")
-        title = ", ".join(filter(None, (event, code, component)))
-        return Accelerogram(
-            samples,
-            agreed_step(name, dt, 1 / rate),
-            unit,
-            title,
-            Origin(event, code, component, _start(told.get("Record Time", "")), code),
-        )
+            stated_numbers(name, header, "Max. Acc. (gal)")
+            check_peak(name, *header["Max. Acc. (gal)"], samples)
+        return Accelerogram.named(samples, agreed_step(name, dt, 1 / rate), unit, _origin(header))
+
+
+def _origin(header: Header) -> Origin:
+    """Return the origin that the header states."""
+    keys = "Origin Time", "Mag.", "Station Code", "Dir.", "Record Time"
+    time, magnitude, code, direction, recorded = (value_of(header, key)[1] for key in keys)
+    event = " ".join(filter(None, (time, magnitude and "M" + magnitude)))
+    return Origin(event, code, _CHANNELS.get(direction, direction), _start(recorded), code)
 
 
 def _start(recorded: str) -> str:
@@ -77,7 +66,7 @@ def _start(recorded: str) -> str:
     return f"{first.strftime(_TIME)} JST"
 
 
-def _header(lines: list[str]) -> dict[str, tuple[int, str]]:
+def _header(lines: list[str]) -> Header:
     """Return line number and value of every key."""
     found = {}
     for number, line in enumerate(lines[:17], 1):
@@ -86,15 +75,6 @@ def _header(lines: list[str]) -> dict[str, tuple[int, str]]:
             break
         found[key] = number, line[len(key) :].strip()
     return found
-
-
-def _stated(name: str, header: dict, key: str, pattern: str) -> list[float]:
-    """Return the numbers that the header must state."""
-    line, value = header.get(key, (0, ""))
-    found = re.fullmatch(pattern, value, re.IGNORECASE)
-    if not found:
-        raise file_error(name, f"header must state a number as {key!r}, but states {value!r}.")
-    return [float(word) for word in found.groups()]
 
 
 def _counts(line: str) -> list[float] | None:

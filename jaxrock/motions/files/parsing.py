@@ -1,7 +1,4 @@
-"""Helpers of all formats: numbers in text, units, and the comparison of header and arguments.
-
-Nothing is guessed: where a header announces a count, a unit or a time step, contradictions raise.
-"""
+"""Helpers of all formats: numbers in text, units of acceleration, and samples in the number that a header announces."""
 
 import functools
 import re
@@ -9,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from jaxrock._text import file_error
+from jaxrock._core.text import file_error, line_error
 
 STANDARD_GRAVITY = 9.80665  # m/s^2, the g of accelerograms (not `rigid.GRAVITY`, the g of the papers)
 PER_G = {"g": 1.0, "m/s2": STANDARD_GRAVITY, "cm/s2": 100 * STANDARD_GRAVITY}
@@ -23,21 +20,14 @@ NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[EeDd][-+]?\d+)?"
 # A broken first line of data must not pass for a line of the header.
 LIKE_DATA = re.compile(r"\s*[-+]?(?:\.?\d|nan\b|inf\b)", re.IGNORECASE)
 
+# Numbers may touch, but only a sign marks the next: 1.234562.34567 is refused.
+_NUMBERS = re.compile(rf"\s*{NUMBER}(?:(?:\s+|(?=[-+])){NUMBER})*\s*")
+_MANY = 50  # lines from which the printed digits are read
+
 
 def to_float(text: str) -> float:
     """Convert a number in text, with Fortran's exponents, too."""
     return float(text.upper().replace("D", "E"))
-
-
-def agreed_step(name: str, given: float | None, stated: float) -> float:
-    """Return the time step [s], after a comparison of the user's and the file's."""
-    if not 0 < stated < np.inf:
-        raise file_error(name, f"states a time step of {stated:g} s, which is not positive.")
-    if given is None:
-        return stated
-    if abs(given - stated) > 1e-3 * stated:
-        raise ValueError(f"Argument `dt` must agree with file `{name}`, which has {stated:g} s, but is {given}.")
-    return given
 
 
 def _spelling(written: str) -> str:
@@ -55,22 +45,6 @@ def is_unit(written: str) -> bool:
     return unit_named(written) is not None
 
 
-def agreed_unit(name: str, line: int, given: str | None, written: str) -> str:
-    """Return the unit, after a comparison of the user's and the header's (`written`, which may be empty)."""
-    if not written:
-        if given is None:
-            told = f"Argument `unit` must be given for file `{name}`, whose header states none, but is None."
-            raise ValueError(told)
-        return given
-    stated = unit_named(written)
-    if stated is None:
-        known = "g, m/s2, cm/s2 or gal"
-        raise file_error(name, f"line {line} states the unit {written!r}, but accelerations must be in {known}.")
-    if given not in (None, stated):
-        raise ValueError(f"Argument `unit` must agree with file `{name}`, which is in {stated!r}, but is {given!r}.")
-    return stated
-
-
 _PLAIN = re.compile(r"[-+.0-9EeDd \t\n]*")
 _NOT_PLAIN = re.compile(r"[^-+.0-9EeDd \t]")
 _TOUCHING = re.compile(r"(?<=[0-9.])(?=[-+])")
@@ -86,12 +60,7 @@ def plain_numbers(lines: list[str]) -> np.ndarray | None:
         return None
     if _TOUCHING.search(text):  # numbers may touch before a sign
         text = _TOUCHING.sub(" ", text)
-    words = text.upper().replace("D", "E").split()
-    try:
-        values = np.array(words, dtype=np.bytes_).astype(float) if words else np.zeros(0)
-    except ValueError:
-        return None
-    return values if np.isfinite(values).all() else None
+    return _finite(np.array(text.upper().replace("D", "E").split(), dtype=np.bytes_))
 
 
 def numbers_of_width(lines: list[str], width: int) -> np.ndarray | None:
@@ -104,8 +73,13 @@ def numbers_of_width(lines: list[str], width: int) -> np.ndarray | None:
     written = np.frombuffer(data, np.uint8).reshape(-1, width) != ord(" ")
     if not (np.sum(written[:, 1:] > written[:, :-1], axis=1) + written[:, 0] == 1).all():
         return None  # an empty field, or two numbers in one
+    return _finite(np.frombuffer(data, f"S{width}"))
+
+
+def _finite(texts: np.ndarray) -> np.ndarray | None:
+    """Return the numbers in texts; None where one is no finite number."""
     try:
-        values = np.frombuffer(data, f"S{width}").astype(float)
+        values = texts.astype(float)
     except ValueError:
         return None
     return values if np.isfinite(values).all() else None
@@ -128,7 +102,7 @@ def announced_samples(
     start: int,
     count: int,
     parse: Callable[[str], list[float] | None],
-    at_once: Callable[[list[str]], np.ndarray | None] = lambda lines: None,
+    at_once: Callable[[list[str]], np.ndarray | None] = plain_numbers,
     what: str = "samples",
 ) -> np.ndarray:
     """Return the `count` samples that must follow line number `start`, and nothing more.
@@ -157,12 +131,12 @@ def _one_by_one(name: str, lines: list[str], start: int, count: int, parse: Call
         row = parse(line)
         if row is not None:
             if not np.isfinite(row).all():
-                raise file_error(name, f"line {number} holds a number that is not finite: {line.strip()[:60]!r}.")
+                raise line_error(name, number, "holds a number that is not finite:", line)
             values += row
         elif _ENDS.search(line):
             break
         elif LIKE_DATA.match(line) or 0 < len(values) < count:
-            raise file_error(name, f"line {number} should hold samples, but is {line.strip()[:60]!r}.")
+            raise line_error(name, number, "should hold samples, but is", line)
         elif values:
             break
     return values
@@ -176,22 +150,30 @@ def announced_columns(
     return announced_samples(name, lines, start, count, parse, at_once, what)
 
 
+def fields_of(line: str, width: int) -> list[str]:
+    """Return the fields of a line, `width` wide; the last may be shorter."""
+    line = line.rstrip()
+    return [line[start : start + width] for start in range(0, len(line), width)]
+
+
 def fixed_numbers(line: str, width: int) -> list[float] | None:
     """Return the numbers in a line of columns `width` wide, which may touch, or None if it holds anything else."""
-    line = line.rstrip()
-    if len(line) % width:
-        return None
-    fields = [line[start : start + width].strip() for start in range(0, len(line), width)]
-    if not all(re.fullmatch(NUMBER, field) for field in fields):
+    fields = fields_of(line, width)
+    if len(line.rstrip()) % width or not all(re.fullmatch(NUMBER, field.strip()) for field in fields):
         return None
     return [to_float(field) for field in fields]
 
 
-def no_column(name: str, column: int | None, kind: str) -> None:
-    """Raise ValueError where a column is asked for in a file with one record."""
-    if column is not None:
-        one = f"{kind} file `{name}` has one record"
-        raise ValueError(f"Argument `column` must be None, because {one}, but is {column}.")
+def free_numbers(line: str) -> list[float] | None:
+    """Return the numbers in a line, or None if it holds anything else; they may touch before a sign."""
+    return [to_float(text) for text in re.findall(NUMBER, line)] if _NUMBERS.fullmatch(line) else None
+
+
+def printed_numbers(lines: list[str]) -> list[str]:
+    """Return numbers as they are printed: many of the first, and the last."""
+    samples = [line for line in lines if line.strip() and _NUMBERS.fullmatch(line)]
+    samples = samples[:_MANY] + samples[max(_MANY, len(samples) - 2) :]
+    return [text for line in samples for text in re.findall(NUMBER, line)]
 
 
 def check_peak(

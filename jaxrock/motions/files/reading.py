@@ -14,10 +14,10 @@ from typing import Annotated
 import numpy as np
 from jaxtyping import ArrayLike
 
-from jaxrock._arguments import arguments, at_least, path_of, word_of
-from jaxrock._checks import one_of, scalar, size
-from jaxrock._precision import frames_of_the_package
-from jaxrock._text import text_lines
+from jaxrock._arguments.annotations import arguments, at_least, path_of, word_of
+from jaxrock._arguments.ranges import one_of, scalar, size
+from jaxrock._core.precision import frames_of_the_package
+from jaxrock._core.text import text_lines
 from jaxrock.motions.files.at2 import AT2
 from jaxrock.motions.files.columns import Columns
 from jaxrock.motions.files.cosmos import COSMOS

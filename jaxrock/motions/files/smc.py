@@ -2,16 +2,10 @@
 
 import re
 
-from jaxrock._text import check_end, file_error
-from jaxrock.motions.files.format import AbstractFormat, Accelerogram
-from jaxrock.motions.files.parsing import (
-    agreed_step,
-    agreed_unit,
-    announced_columns,
-    check_peak,
-    fixed_numbers,
-    no_column,
-)
+from jaxrock._core.text import check_end, file_error
+from jaxrock.motions.files.format import AbstractFormat, Accelerogram, no_acceleration
+from jaxrock.motions.files.headers import agreed_step, agreed_unit, no_column, text_after
+from jaxrock.motions.files.parsing import announced_columns, check_peak, fields_of, fixed_numbers
 from jaxrock.motions.record import Origin
 
 _TEXT, _WHOLE, _REAL = 11, 6, 10  # lines of each header
@@ -20,8 +14,6 @@ _COMMENTS, _COUNT = 15, 16  # places among the whole numbers
 _RATE, _LARGEST, _SMALLEST = 1, 29, 31  # places among the real numbers: samples a second, peaks [cm/s2]
 _UNKNOWN = 1e38
 _WIDTH = 10
-# The name has thirty characters, with or without a comma before the component, and blanks up to its end.
-_STATION = re.compile(r"\s*station\s*=\s*(.*?)\s*(?:\bcomponent\s*=\s*(.*?)\s*)?$", re.IGNORECASE)
 
 
 class SMC(AbstractFormat):
@@ -40,7 +32,7 @@ class SMC(AbstractFormat):
         if not kind or len(lines) < _TEXT + _WHOLE + _REAL:
             raise file_error(name, "line 1 does not say what the file holds, as an SMC file must.")
         if "ACCELEROGRAM" not in kind[2].upper():
-            raise file_error(name, f"line 1 states {kind[2].lower()}, but samples must be accelerations.")
+            raise no_acceleration(name, 1, kind[2])
         whole, real = _whole(lines), _real(lines)
         if whole is None or real is None:
             raise file_error(name, "lines 12 to 27 should hold the numbers of an SMC file's headers.")
@@ -60,9 +52,7 @@ class SMC(AbstractFormat):
         peaks = [abs(real[place]) for place in (_LARGEST, _SMALLEST) if abs(real[place]) < _UNKNOWN]
         if peaks:
             check_peak(name, 18, max(peaks), samples, "the header")
-        origin = _origin(lines[:_TEXT])
-        title = ", ".join(filter(None, (origin.event, origin.station, origin.component)))
-        return Accelerogram(samples, agreed_step(name, dt, 1 / real[_RATE]), unit, title, origin)
+        return Accelerogram.named(samples, agreed_step(name, dt, 1 / real[_RATE]), unit, _origin(lines[:_TEXT]))
 
 
 def _whole(lines: list[str]) -> list[int] | None:
@@ -70,7 +60,7 @@ def _whole(lines: list[str]) -> list[int] | None:
     rows = [line.rstrip() for line in lines[_TEXT : _TEXT + _WHOLE]]
     if any(len(row) % _WIDTH or not re.fullmatch(r"[\s\d-]+", row) for row in rows):
         return None
-    fields = [row[k : k + _WIDTH].strip() for row in rows for k in range(0, len(row), _WIDTH)]
+    fields = [field.strip() for row in rows for field in fields_of(row, _WIDTH)]
     if len(fields) != 48 or not all(re.fullmatch(r"-?\d+", field) for field in fields):
         return None
     return [int(field) for field in fields]
@@ -85,12 +75,12 @@ def _real(lines: list[str]) -> list[float] | None:
 
 def _origin(lines: list[str]) -> Origin:
     """Return the origin from the text header, whose entries have fixed places."""
-    station = _STATION.match(lines[5])
-    time = re.match(r"\s*(\d+\s+\d+\s+\d+\s+\d+)\s+(.*)", lines[3].rstrip())
+    event, named = [lines[3].rstrip()], [lines[5]]
     return Origin(
-        " ".join(time[2].split()) if time else "",
-        " ".join(station[1].split()) if station else "",
-        " ".join((station[2] or "").split()) if station else "",
-        " ".join(time[1].split()) if time else "",
+        text_after(r"^\s*\d+\s+\d+\s+\d+\s+\d+\s+(.*)", event),
+        # The name has thirty characters, with or without a comma before the component, and blanks up to its end.
+        text_after(r"^\s*station\s*=\s*(.*?)\s*(?:\bcomponent\s*=.*)?$", named),
+        text_after(r"^\s*station\s*=.*?\bcomponent\s*=(.*)", named),
+        text_after(r"^\s*(\d+\s+\d+\s+\d+\s+\d+)\s", event),
         lines[2].strip(),
     )

@@ -7,10 +7,11 @@ from typing import Annotated, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from jaxrock._arguments import arguments, at_least, path_of
-from jaxrock._text import file_error, text_lines
+from jaxrock._arguments.annotations import arguments, at_least, path_of
+from jaxrock._core.text import file_error, text_lines
 from jaxrock.motions.files.cosmos import is_spectra
-from jaxrock.motions.files.csmip import chosen_channel, told
+from jaxrock.motions.files.csmip import told
+from jaxrock.motions.files.headers import chosen_channel, places_of
 from jaxrock.motions.files.parsing import NUMBER, announced_columns, fixed_numbers
 from jaxrock.motions.record import Origin
 
@@ -60,7 +61,7 @@ def read_spectra(path: str | os.PathLike, channel: Annotated[int, at_least(0)] =
     """
     path = path_of("path", path)
     name, lines = path.name, text_lines(path)
-    starts = [number for number, line in enumerate(lines) if _FIRST.match(line)]
+    starts = places_of(_FIRST, lines)
     if is_spectra(lines):
         raise file_error(
             name, "is a V3 file of COSMOS; only CSMIP's are read. `intensity` makes spectra of its V2 file."

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxrock._text import file_error
+from jaxrock._core.text import file_error
 from jaxrock.motions.files.parsing import is_unit, unit_named
 
 # A factor beside g: 0.1 g, g/10, 10^-3 g, percent of g.

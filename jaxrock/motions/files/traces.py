@@ -4,8 +4,8 @@ from typing import Annotated, Any
 
 import numpy as np
 
-from jaxrock._arguments import arguments, word_of
-from jaxrock._checks import shown
+from jaxrock._arguments.annotations import arguments, word_of
+from jaxrock._core.arrays import shown
 from jaxrock.motions.files.parsing import PER_G
 from jaxrock.motions.record import Origin, Record
 

@@ -5,10 +5,10 @@ from typing import Annotated
 
 import numpy as np
 
-from jaxrock._arguments import arguments, path_of, word_of
-from jaxrock._aside import written_aside
-from jaxrock._checks import as_meant
-from jaxrock._parameters import check_single
+from jaxrock._arguments.annotations import arguments, path_of, word_of
+from jaxrock._arguments.parameters import check_single
+from jaxrock._arguments.ranges import as_meant
+from jaxrock._core.atomic_files import written_atomically
 from jaxrock.motions.files.parsing import PER_G
 from jaxrock.motions.files.reading import accelerogram_of
 from jaxrock.motions.record import Record
@@ -89,5 +89,5 @@ def _check_name(title: str, lines: list[str], record: Record, kind: str, unit: s
 
 
 def _write(path, lines: list[str]) -> None:
-    with written_aside(path_of("path", path), replace=True) as aside:
+    with written_atomically(path_of("path", path), replace=True) as aside:
         aside.write_text("\n".join(lines) + "\n", encoding="utf-8")

@@ -7,7 +7,7 @@ import importlib
 import inspect
 import pkgutil
 
-from jaxrock._parameters import declared
+from jaxrock._arguments.parameters import declared
 from jaxrock.motions.pulses.pulse import AbstractPulse
 
 

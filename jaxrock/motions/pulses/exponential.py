@@ -5,11 +5,12 @@ import math
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Int
 
-from jaxrock._checks import not_nan, size, strength, with_throw
-from jaxrock._parameters import parameter, set_parameters
-from jaxrock.motions.pulses.pulse import AbstractPulse, Piece, Real, one_piece
-from jaxrock.numerics.choice import where
-from jaxrock.numerics.lookup import pick
+from jaxrock._arguments.parameters import parameter, set_parameters
+from jaxrock._arguments.ranges import not_nan, size, strength, with_throw
+from jaxrock._core.types import Real
+from jaxrock.compiler.hints import select
+from jaxrock.motions.pulses.pulse import AbstractPulse, Piece, one_piece
+from jaxrock.numerics.lookup import take
 from jaxrock.numerics.polynomial import horner
 
 
@@ -74,16 +75,16 @@ class TriangularPulse(AbstractPulse):
     def series(self, piece: Piece, local: Real, unit: Real, order: int) -> list[Real]:
         slope = 2 * self.amplitude / self.duration
         rising = piece == 0
-        value = where(rising, slope * local, self.amplitude - slope * local)
-        return [value, where(rising, slope, -slope) * unit][: order + 1]
+        value = select(rising, slope * local, self.amplitude - slope * local)
+        return [value, select(rising, slope, -slope) * unit][: order + 1]
 
 
 def _growth_ratio(x: Real) -> Real:
     """Return (e^x - 1)/x for x <= 0, smooth through 0."""
     small = jnp.abs(x) < 1e-2
-    far = where(small, -1.0, x)
+    far = select(small, -1.0, x)
     near = horner([jnp.full_like(x, 1 / math.factorial(k + 1)) for k in range(7)], x)
-    return where(small, near, jnp.expm1(far) / far)
+    return select(small, near, jnp.expm1(far) / far)
 
 
 class ExponentialPulse(AbstractPulse):
@@ -123,25 +124,25 @@ class ExponentialPulse(AbstractPulse):
     @property
     def knots(self) -> Real:
         # The layers of a rectangle-like pulse lie at both ends; those of a spike on both sides of the peak.
-        inner = where(self.shape > 0, 0.5 - self._layer, self._layer)
+        inner = select(self.shape > 0, 0.5 - self._layer, self._layer)
         zero = jnp.zeros_like(inner)
         return self.duration * jnp.stack([zero, inner, zero + 0.5, 1 - inner, zero + 1])
 
     def _curved(self, piece: Int[Array, "..."]) -> Bool[Array, "..."]:
         """Return whether a piece is a layer; a layer thinner than rounding counts as none."""
         middle = (piece == 1) | (piece == 2)
-        in_layer = where(self.shape > 0, middle, ~middle)
+        in_layer = select(self.shape > 0, middle, ~middle)
         return in_layer & (jnp.abs(self.shape) < 1e24)
 
     @property
     def scales(self) -> Real:
         scale = self.duration / jnp.clip(2 * jnp.abs(self.shape), 1e-3, 1e25)
-        return where(self._curved(jnp.arange(4)), scale, jnp.inf)
+        return select(self._curved(jnp.arange(4)), scale, jnp.inf)
 
     @property
     def bounds(self) -> Real:
         size = jnp.abs(self.amplitude)
-        outer = where(self.shape > 40, 0.0, size)
+        outer = select(self.shape > 40, 0.0, size)
         return jnp.stack([outer, size, size, outer])
 
     def series(self, piece: Piece, local: Real, unit: Real, order: int) -> list[Real]:
@@ -149,10 +150,10 @@ class ExponentialPulse(AbstractPulse):
         rate = 1 / self.duration  # loop-invariant: computed once
         layer, y = self._layer, local * rate
         spiked = shape > 0
-        down, up = where(spiked, 0.0, shape), where(spiked, shape, 0.0)
+        down, up = select(spiked, 0.0, shape), select(spiked, shape, 0.0)
         # Distance from the nearer foot and from the peak, each without cancellation where it matters.
-        foot = pick(jnp.stack([y, layer + y, 0.5 - y, layer - y]), piece)
-        peak = pick(jnp.stack([0.5 - y, layer - y, y, layer + y]), piece)
+        foot = take(jnp.stack([y, layer + y, 0.5 - y, layer - y]), piece)
+        peak = take(jnp.stack([0.5 - y, layer - y, y, layer + y]), piece)
         per_down, per_up = 1 / _growth_ratio(down), 1 / _growth_ratio(-up)
         fall = jnp.exp(2 * down * foot) * per_down
         rise = jnp.exp(-2 * up * peak) * per_up
@@ -160,13 +161,13 @@ class ExponentialPulse(AbstractPulse):
         value_up = (1 - 2 * peak) * rise * _growth_ratio(up * (2 * peak - 1))
         # Far from its peak a spike is zero to rounding; between its layers a rectangle is one.
         flat, middle = layer < 0.5, (piece == 1) | (piece == 2)
-        value_up = where(~middle & flat, 0.0, value_up)
-        value_down = where(middle & flat, 1.0, value_down)
-        direction = where(piece < 2, 1.0, -1.0)
+        value_up = select(~middle & flat, 0.0, value_up)
+        value_down = select(middle & flat, 1.0, value_down)
+        direction = select(piece < 2, 1.0, -1.0)
         step = direction * unit * rate
-        terms = [self.amplitude * where(spiked, value_up, value_down)]
-        term = self.amplitude * 2 * where(spiked, rise, fall) * step
-        term, ratio = where(self._curved(piece), term, 0.0), 2 * shape * step
+        terms = [self.amplitude * select(spiked, value_up, value_down)]
+        term = self.amplitude * 2 * select(spiked, rise, fall) * step
+        term, ratio = select(self._curved(piece), term, 0.0), 2 * shape * step
         for k in range(1, order + 1):
             terms.append(term)
             term = term * ratio * (1 / (k + 1))

@@ -7,9 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import ArrayLike
 
-from jaxrock._checks import Range, size, strength, with_throw
-from jaxrock._parameters import parameter, set_parameters
-from jaxrock.motions.pulses.pulse import AbstractPulse, Piece, Real, one_piece
+from jaxrock._arguments.parameters import parameter, set_parameters
+from jaxrock._arguments.ranges import Range, size, strength, with_throw
+from jaxrock._core.types import Real
+from jaxrock.motions.pulses.pulse import AbstractPulse, Piece, one_piece
 from jaxrock.motions.pulses.sinusoidal import sinusoid
 
 _above_one = Range("be above 1 and finite, and at most 1e6", 1.0, np.inf, lambda x: (x > 1) & (x <= 1e6))

@@ -5,18 +5,16 @@ import re
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Inexact
 
-from jaxrock._checks import is_at_hand, placed
+from jaxrock._core.arrays import is_concrete, to_device
+from jaxrock._core.types import Real
 from jaxrock.motions.motion import AbstractMotion, Piece as Piece
-
-Real = Inexact[Array, "..."]
 
 
 def one_piece(end: Real) -> Real:
     """Return the knots of a motion that is smooth from 0 to `end`."""
-    if is_at_hand(end):
-        return placed(np.stack([np.zeros_like(end), end]))
+    if is_concrete(end):
+        return to_device(np.stack([np.zeros_like(end), end]))
     return jnp.stack([jnp.zeros_like(end), end])
 
 

@@ -6,10 +6,11 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import ArrayLike
 
-from jaxrock._checks import one_of, size, strength, with_throw
-from jaxrock._parameters import parameter, set_parameters
-from jaxrock.motions.pulses.pulse import AbstractPulse, Piece, Real, one_piece
-from jaxrock.numerics.xla_cpu import keep
+from jaxrock._arguments.parameters import parameter, set_parameters
+from jaxrock._arguments.ranges import one_of, size, strength, with_throw
+from jaxrock._core.types import Real
+from jaxrock.compiler.hints import materialize
+from jaxrock.motions.pulses.pulse import AbstractPulse, Piece, one_piece
 
 # Peak of |y^3 - 3y| e^(-y^2/2), at y^2 = 3 - sqrt(6).
 _ANTISYMMETRIC_PEAK = math.sqrt(3 - math.sqrt(6)) * math.sqrt(6) * math.exp(-(3 - math.sqrt(6)) / 2)
@@ -76,7 +77,7 @@ class RickerPulse(AbstractPulse):
         gauss = [jnp.exp(-(y**2) / 2)]
         gauss.append(-step * y * gauss[0])
         for k in range(1, order):
-            gauss.append(keep(-step * (y * gauss[k] + step * gauss[k - 1]) * (1 / (k + 1)), local))
+            gauss.append(materialize(-step * (y * gauss[k] + step * gauss[k - 1]) * (1 / (k + 1)), local))
         if symmetric:
             factor = [1 - y**2, -2 * y * step, -(step**2)]
         else:

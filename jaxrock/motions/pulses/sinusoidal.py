@@ -5,17 +5,20 @@ import math
 import jax.numpy as jnp
 from jaxtyping import ArrayLike
 
-from jaxrock._checks import size, strength, with_throw
-from jaxrock._parameters import parameter, set_parameters
-from jaxrock.motions.pulses.pulse import AbstractPulse, Piece, Real, one_piece
+from jaxrock._arguments.parameters import parameter, set_parameters
+from jaxrock._arguments.ranges import size, strength, with_throw
+from jaxrock._core.types import Real
+from jaxrock.compiler.hints import materialize
+from jaxrock.motions.pulses.pulse import AbstractPulse, Piece, one_piece
 from jaxrock.numerics.elementary import sine_cosine_of_any
-from jaxrock.numerics.xla_cpu import keep
 
 
 def sinusoid(amplitude: Real, rate: Real, angle: Real, unit: Real, order: int, local: Real) -> list[Real]:
     """Return Taylor coefficients of amplitude sin(angle + rate (time - local)) in time/unit, from u'' = -rate^2 u."""
     sine, cosine = sine_cosine_of_any(angle)
-    return harmonic(keep(amplitude * sine, local), keep(amplitude * cosine, local) * rate * unit, rate * unit, order)
+    return harmonic(
+        materialize(amplitude * sine, local), materialize(amplitude * cosine, local) * rate * unit, rate * unit, order
+    )
 
 
 def harmonic(value: Real, slope: Real, rate: Real, order: int) -> list[Real]:
@@ -94,5 +97,8 @@ class CosinePulse(_OneCycle):
     def series(self, piece: Piece, local: Real, unit: Real, order: int) -> list[Real]:
         rate = 2 * math.pi / self.period
         sine, cosine = sine_cosine_of_any(rate * local)
-        value, slope = keep(self.amplitude * cosine, local), keep(-self.amplitude * sine, local) * rate * unit
+        value, slope = (
+            materialize(self.amplitude * cosine, local),
+            materialize(-self.amplitude * sine, local) * rate * unit,
+        )
         return harmonic(value, slope, rate * unit, order)
