@@ -4,6 +4,8 @@ Fresh processes with an empty cache, in turns: as it is, and without one of the 
 answer, and the least wall time of later ones.
 """
 
+import contextlib
+import importlib
 import json
 import os
 import statistics
@@ -16,7 +18,7 @@ from common import table  # first: the search path
 from peers_solvers.report import surroundings
 
 HERE = Path(__file__).parent
-TIMES = 3
+TIMES = 2
 PULSES = "jnp.linspace(0.25, 0.9, 2000)"
 QUESTIONS = {
     "`outcome`, record": "jax.jit(lambda a: rk.outcome(block, a * record).margin)(1.1)",
@@ -48,8 +50,6 @@ SLOW = {"machine code", "machine code for Diffrax"}  # tried once
 
 def ask(question, trick):
     """Return processor seconds of the first answer in this process, and the least seconds of later ones."""
-    import contextlib  # noqa: F401  (what tricks are written with)
-
     import jax
 
     jax.config.update("jax_enable_x64", True)
@@ -57,7 +57,11 @@ def ask(question, trick):
 
     import jaxrock as rk
 
-    names = dict(locals()) | {"os": os, "contextlib": contextlib}
+    compiler = "jaxrock.compiler."
+    modules = ("tracing", "cache.changes", "hints.low_effort", "llvm.compiled_program", "llvm.jit", "llvm.operations",
+               "primitive.lanes")  # fmt: skip
+    names: dict = {each.split(".")[-1]: importlib.import_module(compiler + each) for each in modules}
+    names |= {"os": os, "contextlib": contextlib}
     exec(WITHOUT[trick], names)
     block, record = rk.Block(0.2, 2.0), rk.example_record()
 

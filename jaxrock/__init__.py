@@ -24,7 +24,7 @@ from jaxrock._core.namespace import shown as _shown
 from jaxrock.blocks import restitution as restitution
 from jaxrock.blocks.rigid import Block as Block
 from jaxrock.compiler import cache as _cache
-from jaxrock.engines.taylor.careful import Series as Series
+from jaxrock.engines.taylor.accurate import Series as Series
 from jaxrock.models.rigid import (
     Housner as Housner,
     Linear as Linear,

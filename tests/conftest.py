@@ -22,7 +22,6 @@ import threading
 from pathlib import Path
 
 import pytest
-from _pytest.runner import pytest_runtest_protocol as protocol
 
 _CHECK_ALL = os.environ.get("JAXROCK_CHECK_ALL") == "1"
 
@@ -154,15 +153,6 @@ def pytest_runtest_teardown(item, nextitem):
     if hasattr(_OF_C, "malloc_trim"):  # what is free is given back only so
         _OF_C.malloc_trim(0)
     _held[0] = _memory()
-
-
-@pytest.hookimpl(tryfirst=True)
-def pytest_runtest_protocol(item, nextitem):
-    """Run a test as pytest does, with room for the frames of all functions that a test calls.
-
-    Plugins that run tests in another way (again, if they fail) are not asked.
-    """
-    return importlib.import_module("jaxrock.compiler.tracing").with_stack(protocol, item, nextitem)
 
 
 def pytest_collection_finish():

@@ -474,7 +474,10 @@ BAD = {
     "folder": (["run", "."], "Is a directory"),
     "no numbers": (["run", "words.txt"], "File `words.txt`: no line holds columns of numbers"),
     "no unit": (["run", "motion.txt", "--dt", "0.02"], "Argument `--unit` must be 'g', .*, but is not given"),
-    "wrong unit": ([*FILE, "--unit", "ft/s2"], "Argument `--unit` must be one of 'g', 'm/s2', 'cm/s2', but is 'ft/s2'"),
+    "wrong unit": (
+        [*FILE, "--unit", "ft/s2"],
+        "Argument `--unit` must be one of 'g', 'm/s2', 'cm/s2', 'mm/s2', but is 'ft/s2'",
+    ),
     "no dt": (["run", "motion.txt", "--unit", "g"], "Argument `--dt` must be given .*, but is not given"),
     "dt 0": ([*FILE, "--dt", "0"], "Argument `--dt` must be positive and finite, .*, but is 0.0"),
     "dt negative": ([*FILE, "--dt", "-0.01"], "Argument `--dt` must be positive and finite, .*, but is -0.01"),

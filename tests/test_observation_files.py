@@ -1,5 +1,6 @@
 """Numbers of a table of rocks that cannot be: refused with the line, the column and the number."""
 
+import numpy as np
 import pytest
 
 import jaxrock as rk
@@ -51,3 +52,19 @@ def test_a_deviation_that_belongs_to_nothing_is_a_number_too(tmp_path):
     row = ONE | {"observed": "stood", "rotation_deg": "", "rotation_deg_sd": "-1"}
     with pytest.raises(ValueError, match="line 2: `rotation_deg_sd` must be 0 or more, but is -1"):
         read(tmp_path, row)
+
+
+@pytest.mark.parametrize("spare", ["", ",", ",,,"])
+@pytest.mark.parametrize("end", ["", ",,,\n,,,\n", ",,,,,,\n\n"])
+def test_empty_columns_and_rows_at_the_end(tmp_path, spare, end):
+    """Check tables of rocks as spreadsheets save them."""
+    path, rows = tmp_path / "rocks.csv", ["alpha_deg,p_rad_per_s,observed,rotation_deg", "9,3,toppled,", "15,2,stood,"]
+    path.write_text("".join(row + spare + "\n" for row in rows) + end)
+    rocks = rk.inverse.read_observations(path)
+    np.testing.assert_allclose(rocks.alpha, np.radians([9, 15]))
+    path.write_text("".join(row + spare + "\n" for row in rows[:2]) + ",,,\n" + rows[2] + "\n")
+    with pytest.raises(ValueError, match="^File `rocks.csv`: line 3: "):
+        rk.inverse.read_observations(path)
+    path.write_text(f"{rows[0]},,\n{rows[1]},,0.5\n")
+    with pytest.raises(ValueError, match="^File `rocks.csv`: line 2: has 6 fields, but there are 4 columns"):
+        rk.inverse.read_observations(path)

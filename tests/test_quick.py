@@ -1,6 +1,6 @@
-"""Fast pass for many scenes: it gives the results of the careful engine, run on a few scenes at a time.
+"""Fast pass for many scenes: it gives the results of the accurate pass, run on a few scenes at a time.
 
-`test_suite_outcomes` compares few scenes, which the careful engine takes in lanes, with each alone; `test_spectra`
+`test_suite_outcomes` compares few scenes, which the accurate pass takes in lanes, with each alone; `test_spectra`
 compares many.
 """
 

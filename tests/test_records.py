@@ -181,9 +181,10 @@ SHAKE = np.array([-1.72, 0.5, 305.02, -12.345, 0.001, 9.999, -99.5, 3.0, 4.25, -
 PER_G = 100 * STANDARD_GRAVITY
 
 
-def channel(number=1, values=SHAKE, announce=" (UNITS: CM/SEC/SEC)", form="%10.3f", step=".010", count=None):
+def channel(number=1, values=SHAKE, announce=" (UNITS: CM/SEC/SEC)", form="%10.3f", step=".010", count=None, peak=None):
     """One channel of a V2 file: three headers, three blocks, and the line that ends it."""
     count = len(values) if count is None else count
+    peak = np.abs(values).max() if peak is None else peak
     text = [
         "CORRECTED ACCELEROGRAM   01336-C0165-79290.04       CHAN  2: 360 DEG     FROM   ",
         "UNCORRECTED ACCELEROGRAM DATA              PROCESSED:           USGS            ",
@@ -195,7 +196,7 @@ def channel(number=1, values=SHAKE, announce=" (UNITS: CM/SEC/SEC)", form="%10.3
         f"CHAN  {number}:   0 DEG     LOCATION: FREEFIELD",
         f"  {count} POINTS OF INSTRUMENT- AND BASELINE-CORRECTED ACCEL, VELOC AND DISPL DATA ",
         "AT EQUALLY-SPACED INTERVALS OF    .010  SEC.",
-        f"PEAK ACCELERATION = {np.abs(values).max():9.3f}    CM/SEC/SEC  AT     .020   SEC.",
+        f"PEAK ACCELERATION = {peak:9.3f}    CM/SEC/SEC  AT     .020   SEC.",
     ]
     headers = "\n".join(text) + "\n" + rows([0] * 100, "%5d", 16) + rows(np.zeros(100), "%10.3f", 8)
     blocks = "".join(
@@ -222,7 +223,7 @@ V2 = channel()
         pytest.param(
             V2.replace("OF ACCEL DATA", "OF ACC DATA").replace("(UNITS: CM/SEC/SEC)", "IN UNITS CM/SEC/SEC"), id="USC"
         ),
-        pytest.param(channel(announce="(UNITS: G)", values=SHAKE / PER_G, form="%10.7f"), id="in g"),
+        pytest.param(channel(announce="(UNITS: G)", values=SHAKE / PER_G, form="%10.7f", peak=305.02), id="in g"),
         pytest.param(V2[: V2.index("   10 POINTS OF VELOC")], id="acceleration only"),
         pytest.param(V2[V2.index("   10 POINTS OF ACCEL") :], id="no header"),
     ],
@@ -393,9 +394,14 @@ def test_unit_of_times_counts_beside_a_title_without_a_unit(file, title):
 
 def test_a_mark_of_a_gap_and_a_wrong_unit_are_warned_of(file):
     """Samples beyond all that was ever recorded."""
-    with pytest.warns(UserWarning, match="`motion.txt` holds an acceleration of 999 g, more than .* is its unit g"):
+    with pytest.warns(
+        UserWarning,
+        match="`motion.txt` holds an acceleration of 999 g, more than .* is its unit g.* it holds 1.02 g .980.7 times",
+    ):
         read_record(file("0.1\n-999\n0.2\n"), dt=0.01, unit="g")
-    with pytest.warns(UserWarning, match="`motion.txt` holds an acceleration of 3.924 g, .* is its unit g") as found:
+    with pytest.warns(
+        UserWarning, match="holds an acceleration of 3.924 g, .* its unit g.*0.4 g .9.807 times"
+    ) as found:
         read_record(file("0.1\n-3.924\n0.2\n"), dt=0.01, unit="g")
     assert len(found) == 1
     with warnings.catch_warnings():
@@ -421,7 +427,7 @@ def test_other_titles_state_no_unit(file, title):
     np.testing.assert_allclose(read_record(path, unit="g").samples, SAMPLES)
 
 
-@pytest.mark.parametrize("unit", ["mg", "%g", "mGal", "ft/s2", "mm/s2", "cm/s", "m", "counts"])
+@pytest.mark.parametrize("unit", ["mg", "%g", "mGal", "ft/s2", "km/s2", "cm/s", "m", "counts"])
 @pytest.mark.parametrize("given", [None, "g"])
 def test_a_column_in_another_unit_is_refused_whatever_is_asked_for(file, unit, given):
     with pytest.raises(ValueError, match=f"line 1 states the unit '{unit}', but accelerations must be in g"):
@@ -510,8 +516,8 @@ def test_a_part_of_g_is_not_g(file, unit):
 
 
 VALUES = [
-    "PGA = 300 cm/s2", "peak (cm/s2): 300", "PGA 300 cm/s2, at 3 s", "PGA, 300 gal", "Peak acceleration in m/s2: 0.311",
-    "Peak acceleration in cm/s2 is 300", "Peak acceleration in m/s2 (NS): 0.3", "Peak acc in (m/s2) at 3.2 s: 0.3",
+    "PGA = 300 cm/s2", "peak (cm/s2): 300", "PGA 300 cm/s2, at 3 s", "PGA, 300 gal", "Peak acceleration in m/s2: 2.94",
+    "Peak acceleration in cm/s2 is 300", "Peak acceleration in m/s2 (NS): 3", "Peak acc in (m/s2) at 3.2 s: 3",
     "Total time in minutes: 1.5", "Total time in minutes 1.5",
 ]  # fmt: skip
 
@@ -631,7 +637,7 @@ def test_many_columns_without_times(file):
         pytest.param(
             ONE_COLUMN,
             {"dt": 0.01, "unit": None},
-            "Argument `unit` must be 'g', 'm/s2' or 'cm/s2' for text",
+            "Argument `unit` must be 'g', 'm/s2', 'cm/s2' or 'mm/s2' for text",
             id="no unit",
         ),
         pytest.param(PAIRS, {"unit": None}, "Argument `unit` must be", id="no unit, 2 columns"),
@@ -718,7 +724,7 @@ def test_even_spacing_is_demanded_to_a_thousandth(file, jitter, fine):
             r"Argument `unit` must agree with file `motion.txt`, which is in '(g|cm/s2)', but is 'm/s2'\.",
         ),
         ({"column": 1}, "Argument `column` must be (None|0 to 0), .* file `motion.txt`.*, but is 1"),
-        ({"unit": "ft"}, r"^Argument `unit` must be one of 'g', 'm/s2', 'cm/s2', but is 'ft'\.$"),
+        ({"unit": "ft"}, r"^Argument `unit` must be one of 'g', 'm/s2', 'cm/s2', 'mm/s2', but is 'ft'\.$"),
         (
             {"format": "sac"},
             r"^Argument `format` must be one of 'at2', 'v2', 'v1', 'esm', .*'csv', but is 'sac'\.$",

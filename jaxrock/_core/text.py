@@ -2,8 +2,10 @@
 
 import os
 import re
+import warnings
 from pathlib import Path
 
+from jaxrock._core.precision import frames_of_the_package
 from jaxrock._core.regular_files import open_regular
 
 _LARGEST = 2**30  # bytes; the lines take several times as much memory
@@ -21,10 +23,11 @@ def line_error(name: str, number: int, told: str, line: str) -> ValueError:
 
 
 def check_end(name: str, lines: list[str], numbers: list[str], by_program: bool = False) -> None:
-    """Raise ValueError where a file may have been cut within its last number.
+    """Raise ValueError where a file was likely cut within its last number, and warn where it may have been.
 
-    The file is whole if a line end follows that number. It is whole, too, if the number is printed as all others are,
-    with as many digits after the point and as long an exponent.
+    The file is whole if a line end or a separator follows that number. It is whole, too, if the number is printed as
+    all others are, with as many digits after the point and as long an exponent. It was likely cut if the number is
+    shorter than all others in its column.
 
     **Arguments:**
 
@@ -36,11 +39,41 @@ def check_end(name: str, lines: list[str], numbers: list[str], by_program: bool 
         numbers = [*numbers[:_MANY], *numbers[-2:]]
     *before, last = map(_shape, numbers)
     alike = len(before) > 1 and len(set(before)) == 1 and before[0] != (0, 0)
-    ended = not lines[-1].strip()
+    ended = not lines[-1].strip() or "#" in lines[-1]
+    ended = ended or bool(numbers[-1].strip()) and not re.search(r"[\d.]$", lines[-1])
     if alike and last != before[0] and (by_program or not ended):
         raise file_error(name, f"the last number, {numbers[-1]!r}, is not printed as all others: the file is cut off.")
-    if not ended and not alike:
-        raise file_error(name, "ends without a line end, so that its last number may be cut off: add one if it is not.")
+    if ended or alike:
+        return
+    told = f"line {len(lines)} ends without a line end"
+    if not before or _has_fewer_digits(last, before) or _is_shorter(lines):
+        short = f"its last number, {numbers[-1].strip()!r}, is shorter than all others in its column"
+        short = short if before else "it holds a single number"
+        raise file_error(name, f"{told}, and {short}: it may be cut off; add a line end if it is not.")
+    warnings.warn(
+        f"File `{name}`: {told}, so that its last number, {numbers[-1].strip()!r}, may be cut off: "
+        "add a line end if it is not.",
+        stacklevel=frames_of_the_package() + 1,
+    )
+
+
+def _has_fewer_digits(last: tuple[int, int], before: list[tuple[int, int]]) -> bool:
+    """Return whether a number has fewer digits after the point, or of its exponent, than all others."""
+    exponents = [each[1] for each in before if each[1] or not last[1]]
+    return last[0] < min(each[0] for each in before) or bool(exponents) and last[1] < min(exponents)
+
+
+_FIELD = re.compile(r"[^\s,;]+")
+_OF_NUMBERS = re.compile(r"[-+.\dEeDd\s,;]*\d[-+.\dEeDd\s,;]*")
+
+
+def _is_shorter(lines: list[str]) -> bool:
+    """Return whether the last number ends before the place where all others of its column end."""
+    rows = [line for line in lines[-_MANY:] if _OF_NUMBERS.fullmatch(line)]
+    ends = [[field.end() for field in _FIELD.finditer(line)] for line in rows]
+    column = len(ends[-1]) - 1 if ends else 0
+    places = {each[column] for each in ends[:-1] if len(each) > column}
+    return len(ends) > 2 and len(places) == 1 and ends[-1][column] < min(places)
 
 
 def _shape(text: str) -> tuple[int, int]:

@@ -239,7 +239,7 @@ class AsymmetricBlock(Owner):
         *,
         base: Annotated[str, word_of("narrow", "wide")] = "narrow",
         plane: Annotated[str, word_of("projection", "cut")] = "projection",
-        unit: Annotated[str, word_of(*LENGTHS)] = "m",
+        unit: Annotated[str | None, word_of(*LENGTHS)] = None,
         tolerance: ArrayLike | None = None,
         restitution: Ratios = None,
         gravity: ArrayLike = GRAVITY,

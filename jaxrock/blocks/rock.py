@@ -14,11 +14,13 @@ from jaxrock._arguments.ranges import direction, finite, positive, scalar
 from jaxrock._core.arrays import Values
 from jaxrock._core.precision import frames_of_the_package
 from jaxrock.blocks.base import arms_of, rolled, rounded_edge
+from jaxrock.blocks.closed_surface import ClosedSurface
 from jaxrock.blocks.edge import Edge
-from jaxrock.blocks.mesh import trimesh_of
+from jaxrock.blocks.mesh import metres_of, triangles_of, trimesh_of
 from jaxrock.blocks.rigid import LENGTHS
 from jaxrock.blocks.section import Section, section_of_slab
 from jaxrock.blocks.slab import Slab
+from jaxrock.blocks.solid import Solid
 
 _PLANES = ("projection", "cut")
 _SHARE = 0.01  # share of the height within which vertices stand on the ground
@@ -43,37 +45,36 @@ class Rock(NamedTuple):
     @classmethod
     @arguments
     def from_mesh(
-        cls, mesh: Any, *, unit: Annotated[str, word_of(*LENGTHS)] = "m", tolerance: ArrayLike | None = None
+        cls, mesh: Any, *, unit: Annotated[str | None, word_of(*LENGTHS)] = None, tolerance: ArrayLike | None = None
     ) -> "Rock":
         """Build a rock from a closed surface.
 
         **Arguments:**
 
         - `mesh`: a `trimesh.Trimesh`, or the path of a file that trimesh reads (STL, PLY, OBJ, ...); its third axis
-          points up, and it stands as it does in the field. Needs `pip install "jaxrock[mesh]"`.
-        - `unit`: of its coordinates: "m", "cm" or "mm".
+          points up, and it stands as it does in the field. Needs `pip install "jaxrock[mesh]"`. Seams are welded.
+          Closed surfaces within the rock that are turned inward are cavities.
+        - `unit`: of its coordinates: "m", "cm" or "mm". None: the unit that the mesh states, else "m".
         - `tolerance`: vertices up to this height above the lowest stand on the ground [m], positive; None: a hundredth
           of the height. Choose the error of the mesh: a smaller tolerance may leave a rock on a needle.
 
-        **Returns:** a `Rock`.
+        **Returns:** a `Rock`. A warning says that faces were turned outward.
 
-        **Raises:** ValueError for a surface that is not closed, a base that is no area, or a centre of mass that is not
-        above it; OSError if the file cannot be opened; ImportError without trimesh.
+        **Raises:** ValueError for a surface that is not closed, for several bodies, or for a unit that the mesh
+        contradicts; for a base that is no area, or a centre of mass that is not above it. OSError if the file cannot be
+        opened; ImportError without trimesh.
         """
         mesh = trimesh_of(mesh)
-        if not bool(mesh.is_volume):
-            raise ValueError("Argument `mesh` must be closed and turned outward, but is not: repair it first.")
-        factor = LENGTHS[unit]
-        vertices, volume = factor * np.asarray(mesh.vertices, float), factor**3 * float(mesh.volume)
-        # trimesh's own density is 1 in its units.
-        inertia = factor**2 * np.asarray(mesh.moment_inertia, float) / float(mesh.volume) / float(mesh.density)
+        factor = metres_of(mesh, unit)
+        vertices, faces = _turned_outward(*triangles_of(mesh))
+        vertices = factor * vertices
+        solid = Solid.within(vertices, faces)
         height = np.ptp(vertices[:, 2])
         tolerance = (
             _SHARE * height if tolerance is None else float(scalar("tolerance", positive("tolerance", tolerance)))
         )
         base = vertices[vertices[:, 2] <= vertices[:, 2].min() + tolerance]
-        centre, faces = factor * np.asarray(mesh.center_mass, float), np.asarray(mesh.faces, int)
-        rock = cls(volume, centre, inertia, vertices, base, tolerance, faces)
+        rock = cls(*solid, vertices, base, tolerance, faces)
         for azimuth in np.linspace(0, np.pi, 180, endpoint=False):
             section = rock._between(azimuth)
             if not section.left[0] < 0 < section.right[0]:
@@ -211,7 +212,23 @@ class Rock(NamedTuple):
         )
 
 
-def section_of(mesh: Any, azimuth: ArrayLike, base: str, plane: str, unit: str, tolerance: ArrayLike | None) -> Section:
+def _turned_outward(
+    vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "m 3"]
+) -> tuple[Float[np.ndarray, "k 3"], Int[np.ndarray, "l 3"]]:
+    """Return the closed surface that triangles make, and warn if faces are turned."""
+    found = ClosedSurface.of(vertices, faces)
+    if found.turned:
+        warnings.warn(
+            f"Argument `mesh` must be turned outward, but {found.turned} of its {len(found.faces)} faces were not: "
+            "they are turned.",
+            stacklevel=frames_of_the_package() + 1,
+        )
+    return found.vertices, found.faces
+
+
+def section_of(
+    mesh: Any, azimuth: ArrayLike, base: str, plane: str, unit: str | None, tolerance: ArrayLike | None
+) -> Section:
     """Return the section of a rock or a mesh, and warn of a base that rolls."""
     rock = mesh if isinstance(mesh, Rock) else Rock.from_mesh(mesh, unit=unit, tolerance=tolerance)
     found = rock.section(azimuth, base, plane)

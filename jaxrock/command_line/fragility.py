@@ -13,6 +13,7 @@ from jaxrock.command_line.options import (
     add_restitution,
     check_points,
     check_range,
+    file_description,
     files_of,
     model_of,
     plain_float,
@@ -44,8 +45,9 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
 def _run(arguments: argparse.Namespace, report: Report) -> None:
     check_points(arguments.points, 3)
     check_range("--levels", arguments.levels)
-    given = {"dt": arguments.dt, "unit": arguments.unit, "column": arguments.column}
-    suite = rk.motions.Suite([rk.read_record(path, **given) for path in files_of(arguments.records)])
+    suite = rk.motions.Suite(
+        [rk.read_record(path, **file_description(arguments)) for path in files_of(arguments.records)]
+    )
     block = rk.Block.from_dimensions(arguments.width, arguments.height, arguments.restitution)
     if arguments.scatter != 0:
         block = rk.blocks.draw_blocks(block, arguments.draws, alpha=arguments.scatter)

@@ -58,19 +58,28 @@ def files_of(words: list[str]) -> list[str]:
 def add_description(parser: argparse.ArgumentParser) -> None:
     """Add options for files that lack time step, unit or column."""
     parser.add_argument("--dt", type=plain_float, help="time between samples [s], for files that do not say")
-    parser.add_argument("--unit", help="g, m/s2 or cm/s2, for files that do not say")
+    parser.add_argument("--unit", help="g, m/s2, cm/s2 or mm/s2, for files that do not say")
     parser.add_argument("--column", type=int, help="column of a CSV, or channel of a V1 or V2 file, from 0")
+    parser.add_argument("--layout", help="rows (one series in reading order) or columns (a table), for text")
+
+
+_OF_FILES = "dt", "unit", "column", "layout"
+
+
+def file_description(arguments: argparse.Namespace) -> dict:
+    """Return what options say of files, as arguments of `read_record`."""
+    return {option: getattr(arguments, option) for option in _OF_FILES}
 
 
 def record_of(arguments: argparse.Namespace) -> rk.Record:
     """Return the chosen record, scaled."""
     if arguments.record is None:
-        for option in ("dt", "unit", "column"):
+        for option in _OF_FILES:
             if getattr(arguments, option) is not None:
                 raise ValueError(f"Option --{option} describes a file, but no RECORD is given.")
         record = rk.example_record()
     else:
-        record = rk.read_record(arguments.record, dt=arguments.dt, unit=arguments.unit, column=arguments.column)
+        record = rk.read_record(arguments.record, **file_description(arguments))
     if not abs(arguments.scale) < float("inf"):
         raise ValueError(f"Argument `--scale` must be finite, but is {arguments.scale:g}.")
     return rk.processing.scaled(record, arguments.scale)

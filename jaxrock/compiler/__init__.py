@@ -1,6 +1,6 @@
 """A compiler for scalar functions at many inputs: in vectors of lanes, with derivatives, kept between sessions.
 
-Imports `jaxrock._core`. It knows no mechanics; `README.md` beside this file has a worked example. Nothing outside of
+Imports `jaxrock._core`. It knows no mechanics; `README.md` beside this file has two examples. Nothing outside of
 this package imports anything but these names, and those of `hints`.
 """
 

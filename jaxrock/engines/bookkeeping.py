@@ -20,7 +20,7 @@ def checked_step(stepper: AbstractStepper, before: State, after: State) -> State
     good = jnp.isfinite(after.opening) & jnp.isfinite(after.velocity) & jnp.isfinite(after.local)
     lost = (after.side != 0) & ~(after.spread.square <= (MOST_OFF * stepper.scene.moments.saddle) ** 2)
     if not stepper.history:
-        # In the free stage only the next peak or passage counts, which `note` judges.
+        # In the free stage only the next peak or passage counts, which `record_extrema` judges.
         lost = lost & (before.piece < stepper.scene.pieces)
     undecided = lost & (after.status == Status.successful)
     status = Status.where(undecided, Status.undecided, after.status)

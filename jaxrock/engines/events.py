@@ -14,7 +14,8 @@ from jaxrock.engines.scene import Scene
 class Events(NamedTuple):
     """One value per kind of event; for a step, whether that event ends it.
 
-    Impact; turning point; extremum of the velocity; the saddle, where the block balances; flat on the ground.
+    Impact; turning point; extremum of the velocity; the saddle, where the block balances; flat on the ground. The
+    series engine watches the last one in histories only.
     """
 
     impact: Any

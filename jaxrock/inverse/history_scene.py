@@ -16,7 +16,7 @@ from jaxrock.compiler import checks
 from jaxrock.compiler.hints import jit_low_effort
 from jaxrock.engines.scene import peak_bound
 from jaxrock.engines.stepper import AbstractEngine
-from jaxrock.engines.taylor.careful import Series
+from jaxrock.engines.taylor.accurate import Series
 from jaxrock.models.equation import AbstractEquation
 from jaxrock.motions.motion import AbstractMotion
 from jaxrock.motions.pulses.exponential import RectangularPulse

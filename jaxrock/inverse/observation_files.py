@@ -100,6 +100,7 @@ def read_observations(path: str | Path) -> Observations:
         for number, line in enumerate(lines, 1)
         if line.strip() and not line.lstrip().startswith("#")
     ]
+    rows = _without_empty_fields(rows)
     if rows:
         _check_comments(path.name, lines, *rows[0])
     if len(rows) < 2:
@@ -119,6 +120,14 @@ def read_observations(path: str | Path) -> Observations:
     if header[-1] not in ("name", "observed"):
         check_end(path.name, lines, [fields[-1] for _, fields in rows[1:]])
     return _observations(rocks, [rock["name"] or f"line {number}" for rock, (number, _) in zip(rocks, rows[1:])])
+
+
+def _without_empty_fields(rows: list[tuple[int, list[str]]]) -> list[tuple[int, list[str]]]:
+    """Return rows without the empty columns and rows that spreadsheets write at the end of a table."""
+    while rows and not any(rows[-1][1]):
+        rows = rows[:-1]
+    width = max((place for place, field in enumerate(rows[0][1], 1) if field), default=0) if rows else 0
+    return [(line, fields if any(fields[width:]) else fields[:width]) for line, fields in rows]
 
 
 def _observations(rocks: list[dict], names: list[str] | None = None) -> Observations:

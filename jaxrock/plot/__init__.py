@@ -1,7 +1,7 @@
 """Figures: functions that take results, draw them into matplotlib axes and return the axes.
 
 The package imports all others except `command_line`. Each kind of result has a module; a new figure is a function in
-one of them.
+one of them, under `style.figure`, and an import here.
 """
 
 from jaxrock._core.namespace import shown as _shown

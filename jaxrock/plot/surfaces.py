@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from jaxrock.engines.taylor.careful import Series
+from jaxrock.engines.taylor.accurate import Series
 from jaxrock.plot.style import (
     BLUE,
     DURATION,

@@ -14,7 +14,7 @@ from jaxrock.blocks.asymmetric import AsymmetricBlock
 from jaxrock.blocks.flexible import FlexibleBlock
 from jaxrock.blocks.rigid import Block
 from jaxrock.engines.stepper import AbstractEngine
-from jaxrock.engines.taylor.careful import Series
+from jaxrock.engines.taylor.accurate import Series
 from jaxrock.engines.taylor.policy import POLICY
 from jaxrock.models.equation import AbstractEquation
 from jaxrock.models.rigid import Housner

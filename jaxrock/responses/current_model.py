@@ -15,7 +15,7 @@ from jaxrock.blocks.asymmetric import AsymmetricBlock
 from jaxrock.blocks.rigid import Block, Side
 from jaxrock.compiler import checks, trace_function
 from jaxrock.engines.stepper import AbstractEngine
-from jaxrock.engines.taylor.careful import Series
+from jaxrock.engines.taylor.accurate import Series
 from jaxrock.models.equation import AbstractEquation, Angle
 from jaxrock.models.spring import Spring
 from jaxrock.models.user_equation import Equation, Functions

@@ -25,7 +25,7 @@ from jaxrock.compiler.hints import jit_low_effort
 from jaxrock.engines.scene import Scene
 from jaxrock.engines.state import Node, State
 from jaxrock.engines.stepper import AbstractEngine, AbstractStepper
-from jaxrock.engines.taylor.careful import Series
+from jaxrock.engines.taylor.accurate import Series
 from jaxrock.engines.trajectory import Trajectory, at_times, times_of
 from jaxrock.flexible.response import FlexibleResponse, simulate_flexible
 from jaxrock.models.equation import AbstractEquation

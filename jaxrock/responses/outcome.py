@@ -17,7 +17,7 @@ from jaxrock.compiler.hints import select
 from jaxrock.engines.scene import Scene
 from jaxrock.engines.state import ROUNDING, State, all_moving, initial_state
 from jaxrock.engines.stepper import AbstractEngine, AbstractStepper
-from jaxrock.engines.taylor.careful import Series
+from jaxrock.engines.taylor.accurate import Series
 from jaxrock.engines.taylor.fast_loop import fast_loop, most_steps
 from jaxrock.engines.taylor.policy import POLICY
 from jaxrock.flexible.response import outcome_flexible

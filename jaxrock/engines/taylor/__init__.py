@@ -1,5 +1,5 @@
 """The series engine: Taylor steps that are exact to rounding.
 
-Imports the modules of `engines`. Start with `careful`, one step of one lane. `fast` does most steps of many lanes,
-`glide` those without events more cheaply, and `follow` is their loop.
+Imports the modules of `engines`. Start with `accurate`, one step of one lane. `fast` does most steps of many lanes,
+`event_free_step` those without events more cheaply, and `fast_loop` is their loop.
 """

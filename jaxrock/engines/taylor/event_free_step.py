@@ -19,7 +19,7 @@ from jaxrock._core.types import Flag, Scalar
 from jaxrock.compiler.hints import select, supports_divergence
 from jaxrock.engines.bookkeeping import MOST_OFF, rounded
 from jaxrock.engines.state import State
-from jaxrock.engines.taylor.careful import TaylorStepper
+from jaxrock.engines.taylor.accurate import TaylorStepper
 from jaxrock.engines.taylor.trial_step import TrialStep
 from jaxrock.engines.uncertainty import GRAZING, StateCovariance
 
@@ -44,7 +44,7 @@ class EventFreeSteps(NamedTuple):
         """Begin a glide."""
         zero = jnp.zeros_like(state.opening)
         moments: Any = stepper.on(state.side).scene.moments  # `Coefficients`: this engine solves no others
-        # So far from balance that the error of the state cannot matter (see `note`).
+        # So far from balance that the error of the state cannot matter (see `record_extrema`).
         doubt = 1.5 * stepper.doubt * MOST_OFF * moments.saddle
         pull = jnp.maximum(jnp.sqrt(state.closeness) * moments.restoring_at_rest, doubt)
         low = jnp.minimum(state.second, (moments.restoring_at_rest - pull) / moments.steepest)

@@ -1,7 +1,7 @@
 """The fast pass: Taylor steps for the many scenes that meet no near tie.
 
 A step is a series, with a certificate of its shape and the turning point within it, if any. It is cut at the first
-level that it meets (ground or saddle). A lane without a certificate is postponed: the careful pass of the series engine
+level that it meets (ground or saddle). A lane without a certificate is rejected: the accurate pass of the series engine
 reruns it afterwards.
 """
 
@@ -20,7 +20,7 @@ from jaxrock.engines.events import Events, landed
 from jaxrock.engines.impact import impact
 from jaxrock.engines.rest import lift, longest_wait
 from jaxrock.engines.state import State
-from jaxrock.engines.taylor.careful import TaylorStepper
+from jaxrock.engines.taylor.accurate import TaylorStepper
 from jaxrock.engines.taylor.expansion import Start, taylor_expansion
 from jaxrock.engines.taylor.policy import POLICY
 from jaxrock.engines.taylor.step_start import first_sign
@@ -258,7 +258,7 @@ def advance(stepper: TaylorStepper, state: State) -> State:
     passed = replace(
         state,
         spread=jax.tree.map(lambda x: materialize_by(x, one), spread),
-        local=state.local + meeting.turn_at * unit,  # at the turning point, for `note`
+        local=state.local + meeting.turn_at * unit,  # at the turning point, for `record_extrema`
         opening=opening,
         velocity=velocity,
         beyond=state.beyond ^ hits.saddle,

@@ -6,19 +6,19 @@ from jaxtyping import Array, Int
 
 from jaxrock.compiler.hints import divergent, supports_divergence
 from jaxrock.engines.state import State
-from jaxrock.engines.taylor.careful import TaylorStepper
+from jaxrock.engines.taylor.accurate import TaylorStepper
 from jaxrock.engines.taylor.event_free_step import EventFreeSteps, flush_error, onward
 from jaxrock.engines.taylor.fast import advance, certain_wait
 from jaxrock.engines.taylor.policy import POLICY
 
 
 def most_steps(pieces: int) -> int:
-    """Return the number of steps after which a scene is left to the careful engine."""
+    """Return the number of steps after which a scene is left to the accurate pass."""
     return POLICY.fast_steps + 3 * pieces
 
 
 def fast_loop(stepper: TaylorStepper, state: State, limit: Int[Array, ""] | int) -> State:
-    """Follow a block to the end of the motion, until it is postponed, or until it has taken `limit` steps in all."""
+    """Follow a block to the end of the motion, until it is rejected, or until it has taken `limit` steps in all."""
     limit = jnp.minimum(limit, most_steps(stepper.scene.most_pieces))
     is_record = POLICY.is_record(stepper.scene.most_pieces)
     return (_under_record if is_record else _under_pulse)(stepper, state, limit)

@@ -14,7 +14,7 @@ class Policy(NamedTuple):
     - `record_order`: order under many pieces; short pieces need few terms.
     - `many_pieces`: number of pieces above which a motion counts as a record.
     - `outcome_steps`: step budget of an outcome; `history_steps`: of a history, besides two for each piece.
-    - `fast_steps`: steps after which a scene is left to the careful pass, besides three for each piece.
+    - `fast_steps`: steps after which a scene is left to the accurate pass, besides three for each piece.
     - `shorter`: shares of a step that are tried for a certificate, after the whole.
     - `round`: steps after which scenes under a record form new chunks where XLA follows them.
     """

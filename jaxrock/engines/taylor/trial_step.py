@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jaxrock._core.types import Flag, Scalar
 from jaxrock.compiler.hints import materialize_by, select
 from jaxrock.engines.state import State
-from jaxrock.engines.taylor.careful import TaylorStepper
+from jaxrock.engines.taylor.accurate import TaylorStepper
 from jaxrock.engines.taylor.expansion import Start, taylor_expansion
 from jaxrock.numerics.polynomial import horner, last_size
 

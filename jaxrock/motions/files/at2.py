@@ -14,10 +14,14 @@ from jaxrock.motions.files.parsing import (
     to_float,
     unit_named,
 )
-from jaxrock.motions.files.titles import SECONDS, SHORT, is_any_unit
+from jaxrock.motions.files.unit_words import SECONDS, SHORT, is_any_unit
 from jaxrock.motions.record import Origin
 
-_UNIT = re.compile(r"\bUNITS\s*(?:OF|IN|[:=])?\s*\(?\s*([^\s,;()]+)(.*)", re.IGNORECASE)
+_UNIT = re.compile(
+    r"\bUNITS(?:\s*[:=]|\s+(?:ARE|OF|IN)\b)*\s*[(\[{]?\s*([^\s,;()\[\]{}]+)(.*)"
+    r"|\bUNIT(?:\s*[:=]|\s+IS\b)\s*[(\[{]?\s*([^\s,;()\[\]{}]+)(.*)",
+    re.IGNORECASE,
+)
 _UNIT_ALONE = re.compile(r"(?:\bIN\b|[(\[])\s*[(\[]?\s*([^\s,;()\[\]]+)(.*)", re.IGNORECASE)
 _TIMES = re.compile(r"\s*[)\]]?\s*(?:[*×/^]|X\s*[-+.\d]|TIMES\b|DIVIDED\b)", re.IGNORECASE)  # a factor beside a unit
 _VALUED = re.compile(r"\s*[)\]]?\s*[:=]\s*[-+.]?\d")  # "PGA (CM/S2) = 805" states no unit of the samples
@@ -89,16 +93,15 @@ def _unit_in(line: str) -> str:
     text.
     """
     found = _UNIT.search(line)
+    word, rest = [part for part in found.groups() if part is not None] if found else ("", "")
     for alone in () if found else _UNIT_ALONE.finditer(line):
         sure = is_any_unit(alone[1]) and alone[1].lower() not in SHORT and alone[1].lower() not in SECONDS
         # A word such as G is a unit beside the word acceleration only.
         sure = sure and not _VALUED.match(alone[2])
         if sure and (is_unit(alone[1]) and len(alone[1]) > 1 or re.search(r"\bACC", line, re.IGNORECASE)):
-            found = alone
+            word, rest = alone.groups()
             break
-    if not found:
-        return ""
-    return found[1] + (found[2].rstrip() if _TIMES.match(found[2]) else "")
+    return word + (rest.rstrip() if word and _TIMES.match(rest) else "")
 
 
 def _origin(title: str) -> Origin:

@@ -5,7 +5,7 @@ import re
 from jaxrock._core.text import check_end, file_error, line_error
 from jaxrock.motions.files.format import AbstractFormat, Accelerogram, no_acceleration
 from jaxrock.motions.files.headers import agreed_step, agreed_unit, chosen_channel, first_match, places_of, text_after
-from jaxrock.motions.files.parsing import announced_columns, check_peak, fixed_numbers
+from jaxrock.motions.files.parsing import PER_G, announced_columns, check_peak, fixed_numbers
 from jaxrock.motions.record import Origin
 
 # "   42000 acceleration pts, approx  210 secs, units=cm/sec2(04),Format=(1E15.6)"
@@ -60,10 +60,12 @@ class COSMOS(AbstractFormat):
             raise file_error(name, f"line {at + 1} states {found}.")
         width = int(width)
         samples = announced_columns(name, lines, at + 1, int(count), width)
-        if not any(re.match(r"\s*End-of-data", line, re.IGNORECASE) for line in lines[at + 1 :][-20:]):
-            check_end(name, lines, [line[-width:] for line in lines[at + 1 :] if line.strip()], by_program=True)
-        if unit == "cm/s2" and reals[_PEAK] != _UNKNOWN:
-            check_peak(name, at + 1, reals[_PEAK], samples, "the header")
+        last = [line for line in lines[at + 1 :] if line.strip()]
+        if fixed_numbers(last[-1], width) is not None:  # no line such as "End-of-data" follows
+            check_end(name, lines, [line[-width:] for line in last], by_program=True)
+        largest = float(abs(samples).max())
+        if reals[_PEAK] != _UNKNOWN and abs(largest - abs(reals[_PEAK])) > 1e-3 * largest:  # in the unit of the samples
+            check_peak(name, at + 1, reals[_PEAK], samples * (PER_G["cm/s2"] / PER_G[unit]), "the header")
         return Accelerogram.named(samples, agreed_step(name, dt, step), unit, _origin(lines[start:at]))
 
 

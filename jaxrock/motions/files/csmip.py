@@ -10,7 +10,18 @@ import numpy as np
 from jaxrock._core.text import check_end, file_error
 from jaxrock.motions.files.format import AbstractFormat, Accelerogram
 from jaxrock.motions.files.headers import agreed_step, agreed_unit, chosen_channel, places_of, text_after
-from jaxrock.motions.files.parsing import NUMBER, announced_columns, check_peak, fields_of, fixed_numbers, to_float
+from jaxrock.motions.files.parsing import (
+    NUMBER,
+    PER_G,
+    announced_columns,
+    check_peak,
+    data_lines,
+    fields_of,
+    fixed_numbers,
+    numbers_of_width,
+    to_float,
+    unit_named,
+)
 from jaxrock.motions.record import Origin
 
 # "5690 POINTS OF ACCEL DATA EQUALLY SPACED AT  .010 SEC.  (UNITS: CM/SEC/SEC)"; later files write
@@ -23,6 +34,26 @@ _CHANNEL = re.compile(
 
 
 _SPECTRA = re.compile(r"^.*RESPONSE (?:AND FOURIER AMPLITUDE )?SPECTRA\b(?!.*:)", re.IGNORECASE)
+
+
+def announces(line: str) -> bool:
+    """Return whether a line announces the samples of a channel."""
+    return _CHANNEL.match(line) is not None
+
+
+def announced(lines: list[str], at: int) -> tuple[int, float, str, int]:
+    """Return the count, the time step [s], the unit and the width of the samples that a line announces.
+
+    Where the line states no width, it is 10, unless another gives as many numbers as it announces.
+    """
+    found = _CHANNEL.match(lines[at])
+    assert found is not None  # the caller has matched the line
+    count, step, unit, width = found.groups()
+    block = data_lines(lines, at + 1)
+    widths = [int(width)] if width else [10, *range(7, 16)]
+    read = ((each, numbers_of_width(block, each)) for each in widths if len(widths) > 1)
+    fitting = (each for each, numbers in read if numbers is not None and len(numbers) == int(count))
+    return int(count), to_float(step), unit, next(fitting, widths[0])
 
 
 class CSMIP(AbstractFormat):
@@ -43,15 +74,13 @@ class CSMIP(AbstractFormat):
             raise file_error(name, "no line announces 'POINTS OF ACCEL DATA', as a corrected V2 file must.")
         channel = chosen_channel(name, "V2", column, len(channels))
         at = channels[channel]
-        count, step, written, width = _CHANNEL.match(lines[at]).groups()
+        count, step, written, width = announced(lines, at)
         unit = agreed_unit(name, at + 1, unit, written)
-        dt = agreed_step(name, dt, to_float(step))
-        width = int(width or 10)
-        samples = announced_columns(name, lines, at + 1, int(count), width)
+        dt = agreed_step(name, dt, step)
+        samples = announced_columns(name, lines, at + 1, count, width)
         if channel == len(channels) - 1:
             check_last_columns(name, lines, at + 1, width)
-        if unit == "cm/s2":
-            _check_peak(name, lines, channels[channel - 1] + 1 if channel else 0, at, samples)
+        _check_peak(name, lines, channels[channel - 1] + 1 if channel else 0, at, samples, unit)
         return Accelerogram(samples, dt, unit, *told(lines[:at], r"\s*CORRECTED ACCELEROGRAM", (2, 6, 7)))
 
 
@@ -64,15 +93,16 @@ def check_last_columns(name: str, lines: list[str], start: int, width: int) -> N
         check_end(name, lines, fields_of(lines[-1], width))
 
 
-_PEAK = re.compile(rf"\s*PEAK\s+ACCELERATION\s*=\s*({NUMBER})\s*CM/SEC/SEC", re.IGNORECASE)
+_PEAK = re.compile(rf"\s*PEAK\s+ACCELERATION\s*[=:]\s*({NUMBER})\s*([A-Z]\S*?)[,.;]?(?:\s|$)", re.IGNORECASE)
 
 
-def _check_peak(name: str, lines: list[str], start: int, at: int, samples: np.ndarray) -> None:
+def _check_peak(name: str, lines: list[str], start: int, at: int, samples: np.ndarray, unit: str) -> None:
     """Check that the largest sample is the peak that the header of a channel states, if it states one."""
     for row in range(start, at):
         found = _PEAK.match(lines[row])
-        if found:
-            check_peak(name, row + 1, found[1], samples)
+        stated = unit_named(found[2]) if found else None
+        if found and stated:
+            check_peak(name, row + 1, found[1], samples * (PER_G[stated] / PER_G[unit]), unit=stated)
 
 
 # CSMIP writes "CHAN  2: 360 DEG", USC "COMP N08W".

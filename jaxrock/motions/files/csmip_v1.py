@@ -6,10 +6,18 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxrock._core.text import file_error
-from jaxrock.motions.files.csmip import check_last_columns, told
+from jaxrock.motions.files.csmip import announced, announces, check_last_columns, told
 from jaxrock.motions.files.format import AbstractFormat, Accelerogram
 from jaxrock.motions.files.headers import agreed_step, agreed_unit, chosen_channel, first_match, places_of
-from jaxrock.motions.files.parsing import NUMBER, announced_columns, check_peak, fixed_numbers, to_float
+from jaxrock.motions.files.parsing import (
+    NUMBER,
+    PER_G,
+    announced_columns,
+    check_peak,
+    fixed_numbers,
+    to_float,
+    unit_named,
+)
 
 _FIRST = re.compile(r"^\s*UNCORRECTED ACCELEROGRAM DATA\b", re.IGNORECASE)
 # " 13200 Accelerogram points at 200 pts/sec in units of g .      Format: (8f9.6)"
@@ -20,6 +28,7 @@ _SAMPLES = re.compile(
 )
 # Times and samples have no such line: the text header states their number and unit.
 _COUNT = re.compile(r"NO\.\s*OF POINTS\s*=\s*(\d+)", re.IGNORECASE)
+_RATE = re.compile(rf"\bAT\s+({NUMBER})\s+SAMPLES/SEC", re.IGNORECASE)
 _UNIT = re.compile(r"UNITS\s+(?:OF UNCOR\w*\s+(?:ACCEL\w*|DATA)\s+)?ARE SEC\w*\s+AND\s+([^\s.,;]+)", re.IGNORECASE)
 _PEAK = re.compile(rf"\bMAX\s*=\s*({NUMBER})\s*(\S+?)\s*,", re.IGNORECASE)
 _TEXT, _WHOLE, _REAL = 13, 7, 7  # lines of each header
@@ -42,8 +51,11 @@ class CSMIPUncorrected(AbstractFormat):
             raise file_error(name, "no line begins with 'Uncorrected accelerogram data', as a V1 file must.")
         channel = chosen_channel(name, "V1", column, len(starts))
         at, end = starts[channel], (*starts[1:], len(lines))[channel]
-        announced = next((number for number in range(at, end) if _SAMPLES.match(lines[number])), None)
-        block = _samples(name, lines, announced) if announced is not None else _pairs(name, lines, at)
+        place = next((row for row in range(at, end) if _SAMPLES.match(lines[row]) or announces(lines[row])), None)
+        if place is None:
+            block = _pairs(name, lines, at)
+        else:
+            block = _as_corrected(name, lines, at, place) if announces(lines[place]) else _samples(name, lines, place)
         if channel == len(starts) - 1:
             check_last_columns(name, lines, block.start, block.width)
         unit = agreed_unit(name, block.line, unit, "g" if _TENTHS.fullmatch(block.unit) else block.unit)
@@ -70,13 +82,26 @@ class _Block(NamedTuple):
 
 def _samples(name: str, lines: list[str], at: int) -> _Block:
     """Return a block that is announced as samples alone."""
-    announced = _SAMPLES.match(lines[at])
-    assert announced is not None  # the caller has matched the line
-    count, rate, unit, width = announced.groups()
+    said = _SAMPLES.match(lines[at])
+    assert said is not None  # the caller has matched the line
+    count, rate, unit, width = said.groups()
     if not to_float(rate) > 0:
         raise file_error(name, f"line {at + 1} states {rate} samples a second.")
     samples = announced_columns(name, lines, at + 1, int(count), int(width))
     return _Block(samples, unit, at + 1, at + 1, int(width), 1 / to_float(rate))
+
+
+def _as_corrected(name: str, lines: list[str], start: int, at: int) -> _Block:
+    """Return a block that is announced as those of corrected files are; `start`: of the text header, which agrees."""
+    count, step, unit, width = announced(lines, at)
+    header = lines[start : start + _TEXT]
+    for pattern, what, value in ((_COUNT, "samples", count), (_RATE, "samples a second", 1 / step if step else 0.0)):
+        found = first_match(pattern, header, start)
+        if found and abs(to_float(found[1][1]) - value) > 1e-3 * value:
+            told = f"line {found[0]} states {found[1][1]} {what}, but line {at + 1} {value:g}"
+            raise file_error(name, f"{told}.")
+    samples = announced_columns(name, lines, at + 1, count, width)
+    return _Block(samples, unit, at + 1, at + 1, width, step)
 
 
 def _pairs(name: str, lines: list[str], at: int) -> _Block:
@@ -112,5 +137,6 @@ def _check_peak(name: str, lines: list[str], at: int, samples: np.ndarray, unit:
     """Check the largest sample against the text header, to the digits that it prints and a twentieth."""
     for row, line in enumerate(lines[at : at + _TEXT], at + 1):
         found = _PEAK.search(line)
-        if found and found[2].lower() == "g" and unit == "g":
-            check_peak(name, row, found[1], samples, unit="g", share=0.05)
+        stated = unit_named(found[2]) if found else None
+        if found and stated:
+            check_peak(name, row, found[1], samples * (PER_G[stated] / PER_G[unit]), unit=stated, share=0.05)

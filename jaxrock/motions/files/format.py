@@ -47,7 +47,10 @@ class AbstractFormat(abc.ABC):
 
     @abc.abstractmethod
     def recognises(self, lines: list[str]) -> bool:
-        """Return whether the lines of a file are of this format, beyond doubt."""
+        """Return whether the lines of a file are of this format, beyond doubt.
+
+        After the 400th line, only those with words are among them.
+        """
 
     @abc.abstractmethod
     def read(self, name: str, lines: list[str], dt: float | None, unit: str | None, column: int | None) -> Accelerogram:
@@ -56,6 +59,7 @@ class AbstractFormat(abc.ABC):
         **Arguments:**
 
         - `name`: of the file, for messages.
+        - `lines`: all lines, without their ends; the last may be empty.
         - `dt`, `unit`, `column`: as given to `read_record`, each valid by itself.
 
         **Returns:** an `Accelerogram`.

@@ -81,7 +81,7 @@ def agreed_unit(name: str, line: int, given: str | None, written: str) -> str:
         return given
     stated = unit_named(written)
     if stated is None:
-        known = "g, m/s2, cm/s2 or gal"
+        known = "g, m/s2, cm/s2, gal or mm/s2"
         raise file_error(name, f"line {line} states the unit {written!r}, but accelerations must be in {known}.")
     if given not in (None, stated):
         raise ValueError(f"Argument `unit` must agree with file `{name}`, which is in {stated!r}, but is {given!r}.")

@@ -9,11 +9,12 @@ import numpy as np
 from jaxrock._core.text import file_error, line_error
 
 STANDARD_GRAVITY = 9.80665  # m/s^2, the g of accelerograms (not `rigid.GRAVITY`, the g of the papers)
-PER_G = {"g": 1.0, "m/s2": STANDARD_GRAVITY, "cm/s2": 100 * STANDARD_GRAVITY}
+PER_G = {"g": 1.0, "m/s2": STANDARD_GRAVITY, "cm/s2": 100 * STANDARD_GRAVITY, "mm/s2": 1000 * STANDARD_GRAVITY}
 _SPELLINGS = (
-    {"g": "g"}
+    dict.fromkeys(["g", "g's"], "g")
     | dict.fromkeys(["m/s2", "m/s/s", "m s-2", "mps2"], "m/s2")
     | dict.fromkeys(["cm/s2", "cm/s/s", "cm s-2", "cmps2", "gal", "gals"], "cm/s2")
+    | dict.fromkeys(["mm/s2", "mm/s/s", "mm s-2", "mmps2"], "mm/s2")
 )
 NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[EeDd][-+]?\d+)?"
 
@@ -30,8 +31,16 @@ def to_float(text: str) -> float:
     return float(text.upper().replace("D", "E"))
 
 
+_SQUARED = re.compile(r"\s+squared$|\^|\*\*")
+_LENGTH = re.compile(r"\b(c|m|centi|milli|)m(?:et(?:er|re))?s?(?=[/ ])")
+
+
 def _spelling(written: str) -> str:
-    text = re.sub(r"\^|\*\*", "", written.lower().rstrip(".")).replace("sec", "s").replace("²", "2")
+    """Return a unit with its words and marks as `_SPELLINGS` has them."""
+    text = written.strip().lower().rstrip(".").replace("²", "2").replace("’", "'")
+    text = _SQUARED.sub(lambda mark: "2" if mark[0].endswith("squared") else "", text)
+    text = re.sub(r"\bsec(?:ond)?s?(?=\W|2|$)", "s", re.sub(r"\s*(?:/|\bper\b)\s*", "/", text)).replace("sec", "s")
+    text = _LENGTH.sub(lambda length: f"{length[1][:1]}m", text)
     return re.sub(r"m\s*[.·⋅ ]\s*s\s*[-−⁻]\s*2$", "m s-2", text)
 
 
@@ -93,7 +102,7 @@ def data_lines(lines: list[str], start: int) -> list[str]:
     return lines[start:]
 
 
-_ENDS = re.compile(r"POINTS OF|^\s*/&|^\s*End-of-data", re.IGNORECASE)  # lines that may follow the samples
+_ENDS = re.compile(r"POINTS OF|^\s*/&|^\s*End[-\s]+of[-\s]+data", re.IGNORECASE)  # lines that may follow the samples
 
 
 def announced_samples(

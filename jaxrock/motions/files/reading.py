@@ -61,6 +61,7 @@ def read_record(
     dt: ArrayLike | None = None,
     unit: Annotated[str | None, word_of(*PER_G)] = None,
     column: Annotated[int | None, at_least(0)] = None,
+    layout: Annotated[str | None, word_of("columns", "rows")] = None,
 ) -> Record:
     """Read an accelerogram from a file.
 
@@ -69,16 +70,20 @@ def read_record(
     - `path`: the file.
     - `format`: "at2" (PEER), "v2" (CSMIP, also USC), "v1" (CSMIP, uncorrected), "esm" (ASCII of the Engineering
       Strong-Motion database), "cosmos" (V1, V2, V2c), "smc" (USGS), "knet" (K-NET and KiK-net, without their offset),
-      or "csv" (columns of text separated by commas, semicolons, tabs or blanks). None recognises it from the content,
+      or "csv" (text: numbers separated by commas, semicolons, tabs or blanks). None recognises it from the content,
       then from the suffix.
-    - `dt`: time between samples [s], positive. Needed for text without times. Needed for V1 files whose samples are not
-      equally spaced: the record follows the straight lines between them. Elsewhere it must agree with the file to 1e-3.
-    - `unit`: of the accelerations in the file, "g", "m/s2" or "cm/s2". Needed for text; elsewhere it
+    - `dt`: time between samples [s], positive. Needed for text without times or a row of count and step. Needed
+      for V1 files whose samples are not equally spaced: the record follows the straight lines between them.
+      Elsewhere it must agree with the file to 1e-3.
+    - `unit`: of the accelerations in the file, "g", "m/s2", "cm/s2" or "mm/s2". Needed for text; elsewhere it
       must agree with the header.
     - `column`: counted from 0. Text: the column of accelerations, needed when there are more than two;
       column 0 then holds the times, unless `column` is 0, or `dt` is given and column 0 also falls. Titles in a header
       count: units of times and accelerations, and which columns are times.
       V1, V2, COSMOS: the channel (None: the first). The others hold one record.
+    - `layout`: of text. "rows": all numbers are one series in reading order, such as eight to a row. "columns": a
+      table. None: a table if it has titles or times, or if `column` is given; a series if a first row of count and
+      step says so. Other formats have one layout.
 
     **Returns:** a `Record` in units of g = 9.80665 m/s^2, named after the header (or the file); its `origin` holds the
     file's metadata. Its first sample is at time 0, whatever the times in the file.
@@ -93,7 +98,17 @@ def read_record(
     path = path_of("path", path)
     lines = text_lines(path)
     chosen = _format_of(lines, path.suffix) if format is None else FORMATS[format]
+    if layout is not None:
+        chosen = _laid_out(path.name, chosen, layout)
     return _record(path, chosen, chosen.read(path.name, lines, dt, unit, column))
+
+
+def _laid_out(name: str, chosen: AbstractFormat, layout: str) -> AbstractFormat:
+    """Return the format of text with a layout, or raise for another format."""
+    if not isinstance(chosen, Columns):
+        told = f"{chosen.name.upper()} file `{name}` has one layout"
+        raise ValueError(f"Argument `layout` must be None, because {told}, but is {layout!r}.")
+    return Columns(_WITH_HEADERS, layout)
 
 
 def accelerogram_of(name: str, lines: list[str]) -> tuple[str, Accelerogram]:
@@ -115,8 +130,12 @@ def _record(path: Path, kind: AbstractFormat, found: Accelerogram) -> Record:
     largest = np.abs(samples).max()
     if largest > STRONGEST:
         told = f"File `{path.name}` holds an acceleration of {largest:.4g} g, more than all but a few records"
+        smaller = [unit for unit in PER_G if PER_G[unit] > PER_G[found.unit]]
+        likely = next((unit for unit in smaller if largest * PER_G[found.unit] <= STRONGEST * PER_G[unit]), None)
+        factor = PER_G[likely] / PER_G[found.unit] if likely else 1.0
+        instead = f" If its unit is {likely}, it holds {largest / factor:.3g} g ({factor:.4g} times less)."
         warnings.warn(
-            f"{told}: is its unit {found.unit}, and does no such number mark a gap?",
+            f"{told}: is its unit {found.unit}, and does no such number mark a gap?{instead if likely else ''}",
             stacklevel=frames_of_the_package() + 1,
         )
     origin = found.origin._replace(format=kind.name, unit=found.unit, file=path.name)

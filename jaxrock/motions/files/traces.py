@@ -17,7 +17,7 @@ def record_of_trace(trace: Any, unit: Annotated[str, word_of(*PER_G)]) -> Record
     **Arguments:**
 
     - `trace`: an `obspy.Trace` of accelerations without gaps, its instrument's response removed.
-    - `unit`: of its samples, which a trace does not tell: "g", "m/s2" or "cm/s2".
+    - `unit`: of its samples, which a trace does not tell: "g", "m/s2", "cm/s2" or "mm/s2".
 
     **Returns:** a `Record`, whose `origin` holds the trace's station, channel and start.
 

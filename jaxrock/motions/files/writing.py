@@ -52,8 +52,8 @@ def write_csv(record: Record, path: str | os.PathLike, unit: Annotated[str, word
     **Arguments:**
 
     - `record`, `path`: as in `write_at2`.
-    - `unit`: of the accelerations in the file, "g" (of 9.80665 m/s^2), "m/s2" or "cm/s2". The file names it in the
-      title of its column, where `read_record` finds it.
+    - `unit`: of the accelerations in the file, "g" (of 9.80665 m/s^2), "m/s2", "cm/s2" or "mm/s2". The file names it in
+      the title of its column, where `read_record` finds it.
 
     **Raises:** OSError if the file cannot be written; ValueError for arguments of other kinds, for a record of one
     sample, which has no step between times, and for a name that reads as a header ("NPTS= 5, DT= .1").
