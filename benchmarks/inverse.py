@@ -277,7 +277,7 @@ def optimizers(kept: dict, rocks: int, starts: int) -> None:
     import optax
     import optimistix
 
-    from jaxrock.inverse.estimate import _starts
+    from jaxrock.inverse.scan import scan, starts as best_of_a_scan
     from jaxrock.inverse.search import summits_of
     from jaxrock.inverse.unknowns import Evaluator
 
@@ -285,7 +285,9 @@ def optimizers(kept: dict, rocks: int, starts: int) -> None:
     pulse, sought, scatter = (rk.ExponentialPulse, three(), 0.2) if many else (rk.SinePulse, unknowns(), 0.1)
     seen = synthetic(rocks, np.random.default_rng(0 if many else [5, rocks]), scatter)
     problem = Problem(rk.inverse.Likelihood(seen, pulse, scatter), sought)
-    begin = _starts(starts, Evaluator(problem))
+    scanned = Evaluator(problem)
+    scan(scanned, 16 * starts)  # as an estimate does
+    begin = best_of_a_scan(scanned, starts)
     methods = {
         "own climbers": None,
         "optimistix.BFGS": optimistix.BFGS(rtol=1e-6, atol=1e-6),

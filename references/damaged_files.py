@@ -112,6 +112,35 @@ def _smc() -> str:
     return head + body + "".join("".join(printed[k : k + 8]) + "\n" for k in range(0, len(printed), 8))
 
 
+def _geonet(corrected: bool = False, component: str = "S16W", factor: float = 1.0) -> str:
+    values = np.round(SAMPLES * 9806.65 * factor, 1)
+    kind, counts = "Corrected" if corrected else "Uncorrected", np.zeros((10, 10))
+    counts[3, 3 if corrected else 0] = values.size
+    counts[3, 4:6] = (values.size, values.size) if corrected else 0
+    step = "Instrument corrected data at 0.020 sec intervals"
+    text = [
+        f"{kind} accelerogram 20160214_001343_NBLC_20 GNS Science",
+        "Site NBLC      43 30 25S  172 43 53E     Cusp file:  20160214_001345_NBLC",
+        "New Brighton Library",
+        "Instrument Cusp_323",
+        "Resolution: 18-bit   Instr Period: 0.0050 s   Damping: 0.700",
+        "Accelerogram 20160214_001343_NBLC_20                 Processed 2016 February 22",
+        "11 km east of Christchurch",
+        "2016 February 14         00:13:43 UT",
+        "Epicentre  43 29 50S 172 45 18E  Bearing N61E  Dist    2km  Depth    8km M  5.70",
+        f"Number of points  {values.size}    Duration {0.02 * values.size:.2f} s",
+        step if corrected else "Raw readings in units of 1.00 mm/s/s  at intervals of 0.020 s",
+        "Data is unfiltered",
+        f"Component {component}",
+        f"Acceleration:  Peak  {values[np.abs(values).argmax()]:.1f} mm/s/s at   0.14 s     RMS    45.6 mm/s/s",
+        "Velocity:      Peak     1.65 mm/s   at   0.30 s     RMS     0.09 mm/s",
+        "Displacement:  Peak    0.131 mm     at   0.30 s     RMS    0.007 mm",
+    ]
+    more = 2 * _lines(values / 50, "%8.2f", 10) if corrected else ""
+    numbers = _lines(counts[:4].ravel(), "%8d", 10) + _lines(counts[4:].ravel(), "%8.2f", 10)
+    return "\n".join(text) + "\n" + numbers + _lines(values, "%8.1f", 10) + more
+
+
 def _knet() -> str:
     counts = np.random.default_rng(6).integers(-99999, 99999, 24)
     peak = np.abs(counts - counts.mean()).max() * 3920 / 6182761
@@ -206,6 +235,7 @@ FILES = {
     "COSMOS": _record(_cosmos(), ".V2c"),
     "SMC": _record(_smc(), ".smc"),
     "K-NET": _record(_knet(), ".NS"),
+    "GeoNet": _record(_geonet(), ".V1A"),
     "CSV": _record(_pairs("%.5f", ","), ".csv", unit="g"),
     "columns of free form": _record(_pairs("%r", "\t"), ".txt", unit="g"),
     "one column": _record("".join(f"{x!r}\n" for x in SAMPLES.tolist()), ".txt", unit="g", dt=0.01),

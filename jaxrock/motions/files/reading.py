@@ -25,6 +25,7 @@ from jaxrock.motions.files.csmip import CSMIP
 from jaxrock.motions.files.csmip_v1 import CSMIPUncorrected
 from jaxrock.motions.files.esm import ESM
 from jaxrock.motions.files.format import AbstractFormat, Accelerogram
+from jaxrock.motions.files.geonet import GeoNet
 from jaxrock.motions.files.knet import KNET
 from jaxrock.motions.files.parsing import PER_G
 from jaxrock.motions.files.smc import SMC
@@ -40,6 +41,7 @@ _WITH_HEADERS = (
     COSMOS(),
     SMC(),
     KNET(),
+    GeoNet(),
 )
 
 _HEADER = 400  # lines in which headers of fixed places end
@@ -70,8 +72,8 @@ def read_record(
     - `path`: the file.
     - `format`: "at2" (PEER), "v2" (CSMIP, also USC), "v1" (CSMIP, uncorrected), "esm" (ASCII of the Engineering
       Strong-Motion database), "cosmos" (V1, V2, V2c), "smc" (USGS), "knet" (K-NET and KiK-net, without their offset),
-      or "csv" (text: numbers separated by commas, semicolons, tabs or blanks). None recognises it from the content,
-      then from the suffix.
+      "geonet" (V1A and V2A of New Zealand), or "csv" (text: numbers separated by commas, semicolons, tabs or blanks).
+      None recognises it from the content, then from the suffix.
     - `dt`: time between samples [s], positive. Needed for text without times or a row of count and step. Needed
       for V1 files whose samples are not equally spaced: the record follows the straight lines between them.
       Elsewhere it must agree with the file to 1e-3.
@@ -80,7 +82,7 @@ def read_record(
     - `column`: counted from 0. Text: the column of accelerations, needed when there are more than two;
       column 0 then holds the times, unless `column` is 0, or `dt` is given and column 0 also falls. Titles in a header
       count: units of times and accelerations, and which columns are times.
-      V1, V2, COSMOS: the channel (None: the first). The others hold one record.
+      V1, V2, COSMOS, GeoNet: the channel (None: the first). The others hold one record.
     - `layout`: of text. "rows": all numbers are one series in reading order, such as eight to a row. "columns": a
       table. None: a table if it has titles or times, or if `column` is given; a series if a first row of count and
       step says so. Other formats have one layout.
