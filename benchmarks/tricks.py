@@ -1,4 +1,4 @@
-"""What each trick of the compiler is worth: `python benchmarks/tricks.py` writes `tricks.md`.
+"""Measure each trick of the compiler by leaving it out: `python benchmarks/tricks.py` writes `tricks.md`.
 
 Fresh processes with an empty cache, in turns: as it is, and without one of the tricks. Processor seconds of the first
 answer, and the least wall time of later ones.

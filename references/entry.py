@@ -1,4 +1,4 @@
-"""What a cold `outcome` passes before it reaches the physics: `python -m references.entry` prints it.
+"""Count the files that a cold `outcome` enters before the physics: `python -m references.entry` prints it.
 
 Counted in a fresh process, by the calls of Python functions:
 

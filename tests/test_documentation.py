@@ -104,7 +104,7 @@ PATH_OF_A_FILE = re.compile(r"`([\w.]+(?:/[\w.]+)*/?)`")
 
 
 def paragraphs(text):
-    """Paragraphs and items of lists of a page; tables, headings and code are none."""
+    """Return paragraphs and items of lists of a page, without tables, headings and code."""
     found = [""]
     for line in re.sub(r"^```.*?^```", "", text, flags=re.DOTALL | re.MULTILINE).splitlines():
         if not line.strip() or line.lstrip().startswith(("|", "#")):
