@@ -46,6 +46,11 @@ def test_components(file):
         rk.read_record(path, column=3)
 
 
+def test_one_component_is_no_pair(file):
+    with pytest.raises(ValueError, match="Argument `paths` must be a file for each component, because GeoNet file"):
+        rk.motions.read_components(file(RAW))
+
+
 COUNT = f"Number of points  {SAMPLES.size}"
 
 

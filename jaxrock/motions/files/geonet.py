@@ -62,7 +62,11 @@ class GeoNet(AbstractFormat):
 
     def components(self, name, lines):
         """Return the channels, of which GeoNet's files have three: two horizontal ones and the vertical one."""
-        return tuple(range(len(places_of(_FIRST, lines))))
+        count = len(places_of(_FIRST, lines))
+        if count < 2:
+            told = f"GeoNet file `{name}` holds one component"
+            raise ValueError(f"Argument `paths` must be a file for each component, because {told}.")
+        return tuple(range(count))
 
 
 def _stated(name: str, first: int, text: list[str], pattern: re.Pattern) -> re.Match:
