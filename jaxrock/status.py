@@ -49,9 +49,9 @@ class Status(Enumeration):
     )
     undecided = item(
         "Too close to call: a near balance, a grazing impact or long chaotic rocking makes the response so sensitive "
-        "that errors of this computation decide it. Where they are larger than rounding, a tighter tolerance or a "
-        "higher `order` of the engine lowers them, and may decide; where a chaotic tail makes rounding grow as large, "
-        "no setting of an engine decides."
+        "that errors of this computation decide it; `overturned_share` tells how many of the motions that they allow "
+        "overturn. Where errors are larger than rounding, a tighter tolerance or a higher `order` of the engine lowers "
+        "them, and may decide; where chaotic rocking makes rounding grow as large, no setting of an engine decides."
     )
     solver_failed = item(
         "The differential equation solver gave up: its nonlinear solver failed or its steps became too small."
@@ -59,6 +59,15 @@ class Status(Enumeration):
     not_finite = item(
         "The state or the motion stopped being a finite number, or a law of restitution left [0, 1]. Check the inputs."
     )
+    chaotic = item(
+        "The verdict holds, but the peak is known only to `error`: long chaotic rocking amplifies rounding errors "
+        "beyond the rotation itself, and every motion that they allow has the same verdict."
+    )
+
+
+def is_decided(status: Status) -> Bool[Array, "..."]:
+    """Return whether the verdict holds: the response was computed, or is chaotic."""
+    return (status == Status.successful) | (status == Status.chaotic)
 
 
 def still_where(lost: Bool[Array, ""], values: Any) -> Any:

@@ -29,6 +29,7 @@ import numpy as np
 from hypothesis import strategies as st
 
 import jaxrock as rk
+from jaxrock.status import is_decided
 
 jax.config.update("jax_enable_x64", True)  # before the arguments below are made
 
@@ -67,6 +68,13 @@ def simulated():
     """A history that has numbers: at the usual tolerance steps of order 4 are used up."""
     engine = rk.Series(order=4, tolerance=1e-6)
     return rk.simulate(block(), pulse(), rk.Linear(), engine=engine, duration=2.0, samples=24)
+
+
+def ends():
+    """Return critical values of one scene: an interval and an end above it."""
+    value, rising = jnp.array([1.0, 1.001, 3.0]), jnp.array([True, False, True])
+    numbers = (value, value, rising, jnp.zeros(3, int), rising, value[:, None])
+    return rk.studies.Critical(jnp.array(3), *numbers, jnp.array(True), ("alpha",), scale=value)
 
 
 def rocks():
@@ -329,16 +337,17 @@ CALLS: dict[str, Call] = {
     # Studies
     "critical_amplitudes": Call(
         rk.critical_amplitudes,
-        {**SCENE, "intensity": (2.0, 3.0), "derivatives": False, "progress": False},
+        {**SCENE, "intensity": (2.0, 3.0), "derivatives": False, "narrowest": 0.01, "progress": False},
         True,
-        "derivative|value|intensity",
+        "derivative|value|intensity|scale",
     ),
     "critical_durations": Call(
         rk.studies.critical_durations,
-        {**SCENE, "factor": (0.5, 1.0), "derivatives": False, "progress": False},
+        {**SCENE, "factor": (0.5, 1.0), "derivatives": False, "narrowest": 0.01, "progress": False},
         True,
-        "derivative|value|intensity",
+        "derivative|value|intensity|scale",
     ),
+    "Critical.without_thin": Call(ends().without_thin, {"narrowest": 0.01}, may_be="derivative|value|intensity|scale"),
     "sensitivity": Call(rk.studies.sensitivity, SCENE, True, ".*"),
     "sensitivity_map": Call(
         rk.studies.sensitivity_map,
@@ -353,7 +362,7 @@ CALLS: dict[str, Call] = {
         rk.studies.self_similar_spectrum, {**RANGES, "alpha": 0.2, "restitution": 0.9, "pulse": rk.SinePulse}, True
     ),
     "overturning_map": Call(
-        rk.overturning_map, {**RANGES, "alpha": 0.2, "restitution": 0.9, "pulse": rk.SinePulse}, True, "max_rotation"
+        rk.overturning_map, {**RANGES, "alpha": 0.2, "restitution": 0.9, "pulse": rk.SinePulse}, True, "rotation_ratio"
     ),
     "similarity.groups": Call(
         rk.similarity.groups, {"block": block(), "amplitude": 0.5, "frequency": 6.0, "kind": "rigid"}
@@ -890,11 +899,14 @@ def _lost(result: Any) -> bool:
 
 
 def _of_outcome(result: Any) -> str | None:
-    if int(np.asarray(result.status._value)) != 0:
+    if not bool(is_decided(result.status)):
         return None
     peak, lost = float(result.max_rotation), bool(result.overturned)
     if np.isnan(peak) or np.isinf(peak) != lost:
         return f"silent: max_rotation is {peak}, overturned {lost}"
+    share = float(getattr(result, "overturned_share", lost))
+    if share != lost:
+        return f"silent: overturned_share is {share}, overturned {lost}"
     margin = float(getattr(result, "margin", 0.0))
     return None if np.isfinite(margin) else f"silent: margin is {margin}"
 

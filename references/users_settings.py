@@ -145,8 +145,8 @@ CALLS: dict[str, Callable] = {
     "flexible history": lambda: rk.simulate(column(), pulse(0.4), duration=2.0, samples=10).rotation,
     "flexible with P-Delta": lambda: rk.outcome(column(p_delta=True), pulse(0.25), duration=1.0).max_rotation,
     "sweep": lambda: rk.sweep(margin, amplitude=[0.2, 0.3], progress=False).values,
-    "rocking_spectrum": lambda: rk.rocking_spectrum(0.2, pulse(), [2.0, 3.0], progress=False).max_rotation,
-    "overturning_map": lambda: rk.overturning_map([2.0, 4.0], [1.5, 3.0], alpha=0.2, progress=False).max_rotation,
+    "rocking_spectrum": lambda: rk.rocking_spectrum(0.2, pulse(), [2.0, 3.0], progress=False).rotation_ratio,
+    "overturning_map": lambda: rk.overturning_map([2.0, 4.0], [1.5, 3.0], alpha=0.2, progress=False).rotation_ratio,
     "critical_amplitudes": lambda: rk.critical_amplitudes(block(), pulse(), intensity=(1.0, 4.0), progress=False).value,
     "sensitivity": lambda: rk.studies.sensitivity(block(), pulse()).margin.value,
     "single_lobe": lambda: [

@@ -11,7 +11,9 @@ import scipy.integrate
 import scipy.stats
 
 import jaxrock as rk
-from jaxrock.inverse.calibration_grid import Axis, blocks_of_cells
+from jaxrock.inverse.calibration_grid import Axis, Table, blocks_of_cells
+from jaxrock.studies.suite_scenes import Scenes, scenes_of_suite, stacked
+from references import chaotic
 
 RANDOM = np.random.default_rng(1)
 COUNT, ALPHA, SCATTER, P = 200, 0.2, 0.3, 3.0
@@ -282,3 +284,27 @@ def test_the_cell_that_makes_no_block_is_named(block, message):
         rk.inverse.calibrate_block(
             block, motions()[:2], [1, 0], {"alpha": unknown}, {"alpha": 0.3}, cells=16, progress=False
         )
+
+
+def test_open_scenes_count_by_their_share():
+    """Two orientations and two cells; bounds count none and all."""
+    verdict = np.array([[[1, -1], [0, -1]]], np.int8)
+    share = np.array([[[1.0, 0.25], [0.0, 0.75]]])
+    found = Scenes(verdict, np.zeros(verdict.shape), np.zeros(verdict.shape), share)
+    one, both = (Table.of(found, np.ones(1), np.array([way]), None, 0.3, (2,)) for way in (1, 0))
+    for table, toppled, lower, upper in ((one, [1, 0.25], [1, 0], [1, 1]), (both, [0.5, 0.5], [0.5, 0], [0.5, 1])):
+        for found, expected in zip((table.toppled, table.lower, table.upper), (toppled, lower, upper)):
+            np.testing.assert_array_equal(found[0], expected)
+
+
+def test_the_share_of_a_scene_that_chaos_leaves_open():
+    """One is open and one decided; with few steps neither is computed."""
+    motion = rk.Record(*chaotic.record("twice"))
+    blocks = rk.Block(np.array([0.24497866312686414, 0.9]), 1.8891563520285026, 0.9117647058823529)
+    found = scenes_of_suite(stacked(blocks), rk.motions.Suite([motion]), np.array([1.516]), rk.Housner(), None, False)
+    np.testing.assert_array_equal(found.verdict.ravel(), [-1, 0])
+    assert 0.1 < found.share[0, 0, 0] < 0.9 and found.share[0, 0, 1] == 0
+    few = rk.Series(max_steps=20)
+    found = scenes_of_suite(stacked(blocks), rk.motions.Suite([motion]), np.array([1.516]), rk.Housner(), few, False)
+    np.testing.assert_array_equal(found.verdict.ravel(), [-1, -1])
+    np.testing.assert_array_equal(found.share.ravel(), [0.5, 0.5])

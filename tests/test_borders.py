@@ -159,7 +159,7 @@ def test_where_impacts_give_way_to_none_without_a_gap(monkeypatch):
 
     def margins(self, z, ratio):
         intensity = np.exp(z)
-        return 2 - intensity, -intensity, np.where(intensity > 2 + ratio, 0, 1)
+        return 2 - intensity, -intensity, np.where(intensity > 2 + ratio, 0, 1), np.zeros(z.shape, bool)
 
     monkeypatch.setattr(borders._Search, "at", margins)
     for (lower, upper), cut in zip(borders._Search((), 1.0, 4.0, False).columns(np.array([1.0, 0.5])), (3, 2.5)):
@@ -221,7 +221,7 @@ def test_survivors_are_coloured_up_to_the_border(surface):
     axis = rk.plot.overturning(surface, exact=False)
     peaks = np.ma.filled(axis.collections[0].get_array(), np.nan).reshape(surface.state.shape)
     safe = np.asarray(surface.state) == 0
-    np.testing.assert_array_equal(peaks[safe], np.asarray(surface.max_rotation)[safe])
+    np.testing.assert_array_equal(peaks[safe], np.asarray(surface.rotation_ratio)[safe])
     beside = ~safe[:, :-1] & safe[:, 1:]
     assert beside.any() and np.isfinite(peaks[:, :-1][beside]).all()
 
@@ -253,7 +253,7 @@ def test_curves_reach_their_tips(with_curves):
 
 def test_isolated_survivors_of_a_spectrum_are_seen():
     peaks = np.array([[np.inf, 0.7, np.inf, np.inf, 0.5, 0.4]])
-    told = {"abscissa": np.arange(6.0), "max_rotation": peaks, "max_velocity": peaks, "margin": -peaks,
+    told = {"abscissa": np.arange(6.0), "rotation_ratio": peaks, "velocity_ratio": peaks, "margin": -peaks,
             "impact_count": np.zeros((1, 6), int), "overturned": np.isinf(peaks),
             "intensity": np.array([2.0])}  # fmt: skip
     spectrum = rk.studies.Spectrum(**jax.device_put(told), status=rk.Status.successful)

@@ -199,7 +199,7 @@ def ratios(model):
 QUICK = {
     "outcome": of_model(lambda model: rk.outcome(BLOCK, PULSE, model, engine=ENGINE).max_rotation),
     "overturning_map of a pulse": of_pulse(
-        lambda f: rk.overturning_map([1.0, 2.0], [1.2, 1.5], pulse=f, **SHORT).max_rotation
+        lambda f: rk.overturning_map([1.0, 2.0], [1.2, 1.5], pulse=f, **SHORT).rotation_ratio
     ),
     "feasible_region": (region, pulse),
 }
@@ -425,7 +425,7 @@ SOFT = float(np.sqrt(0.8))
 
 def soft_map(held, plain):
     found = rk.overturning_map([2.0, 3.0], [1.5, 3.0], **held)
-    return found.max_rotation, rk.overturning_map(np.array([2.0, 3.0]) / SOFT, [1.5, 3.0], **plain).max_rotation
+    return found.rotation_ratio, rk.overturning_map(np.array([2.0, 3.0]) / SOFT, [1.5, 3.0], **plain).rotation_ratio
 
 
 def soft_suite(held, plain):

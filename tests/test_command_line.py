@@ -1,6 +1,7 @@
 """The command line: what it writes and prints, and one clear line where the input is bad."""
 
 import argparse
+import dataclasses
 import errno
 import io
 import json
@@ -24,7 +25,7 @@ import jaxrock as rk
 from jaxrock.command_line import invert, output
 from jaxrock.command_line.fragility import _entries, _write
 from jaxrock.command_line.main import main
-from jaxrock.command_line.options import add_pulse, extent_of, files_of, pulse_of
+from jaxrock.command_line.options import add_pulse, each_once, extent_of, files_of, pulse_of
 from jaxrock.command_line.output import Entry, heard
 from jaxrock.command_line.results import HASH_FILE, ResultFolder
 from jaxrock.inverse.observation_files import EXAMPLE
@@ -107,7 +108,9 @@ def test_run_on_the_built_in_record(command, tmp_path):
     assert table["frequency parameter p"] == f"{float(BLOCK.p):.4f}"
     assert table["restitution"] == f"{1 - 1.5 * 0.04 / 1.04:.4f}"
     assert table["uplift threshold"] == "0.2000"
-    assert table["impacts during the motion"] == str(result.impact_count)
+    assert table["impacts during the motion, above 1e-6 alpha"] == str(result.large_impact_count)
+    assert table["with hops down to rounding"] == str(result.impact_count)
+    assert result.large_impact_count < result.impact_count
     assert table["peak rotation"] == f"{float(result.max_rotation):.6f}"
     assert table["at time"] == f"{float(result.time_of_max):.4f}"
     assert table["peak angular velocity"] == f"{float(result.max_velocity):.6f}"
@@ -157,7 +160,11 @@ def test_run_of_a_block_that_never_moves(command, at2, tmp_path):
         aside.touch()
     status, table, _ = command("run", at2, *GIVEN, "--scale", "0.1")
     assert status == 0 and not film.exists()
-    assert (table["verdict"], table["impacts during the motion"], table["peak rotation"]) == ("stands", "0", "0.000000")
+    assert (table["verdict"], table["with hops down to rounding"], table["peak rotation"]) == (
+        "stands",
+        "0",
+        "0.000000",
+    )
     assert (tmp_path / "out" / "impacts.csv").read_text() == "time_s,velocity_before_rad_per_s\n"
 
 
@@ -181,8 +188,8 @@ def test_impacts_of_a_history_that_is_shorter(command, at2, tmp_path, undrawn):
     """The table counts those of the motion, and those in the file beside them."""
     words = ("run", at2, *GIVEN, "--duration", "0.01")
     _, table, _ = command(*words)
-    assert int(table["impacts during the motion"]) > 0
-    assert table["impacts in 0.01 s of history"] == "0"
+    assert int(table["impacts during the motion, above 1e-6 alpha"]) > 0
+    assert table["with these in 0.01 s of history"] == "0"
     assert (tmp_path / "out" / "impacts.csv").read_text().count("\n") == 1
 
 
@@ -241,6 +248,24 @@ def test_run_that_cannot_be_completed(command, at2):
     assert re.fullmatch(r"jaxrock: these are not results: The step budget was used up .*\n", errors)
 
 
+@pytest.mark.parametrize("kind", ["chaotic", "undecided"])
+def test_run_of_a_chaotic_scene(kind, at2, tmp_path, capsys, monkeypatch, undrawn):
+    """A verdict that holds is a result, with the error of its peak; of an open one the share is told."""
+    computed = rk.outcome
+    numbers = {"known_until": 1.5, "error": 0.01, "overturned_share": 0.4}
+    changes = {"status": getattr(rk.Status, kind)} | jax.tree.map(jnp.asarray, numbers)
+    monkeypatch.setattr(rk, "outcome", lambda *given: dataclasses.replace(computed(*given), **changes))
+    status = main(["run", at2, *GIVEN, "--out", str(tmp_path / "out")])
+    printed = capsys.readouterr()
+    assert re.search(r"one of many motions after +1\.50  s", printed.out)
+    chaotic = kind == "chaotic"
+    for said in (r"\nThe verdict holds, but the peak is known only", r"known to a standard error of +0\.010000  rad"):
+        assert bool(re.search(said, printed.out)) == chaotic
+    assert bool(re.search(r"share of possible motions that overturns +0\.40", printed.out)) != chaotic
+    assert status == (0 if chaotic else 1)
+    assert printed.err == "" if chaotic else printed.err.startswith("jaxrock: these are not results: Too close to call")
+
+
 def test_fragility(command, column, tmp_path):
     """Compare the fragility of two records with the library's table."""
     other = tmp_path / "other.csv"
@@ -285,7 +310,9 @@ def test_patterns_that_no_shell_has_expanded(tmp_path):
     for name in names:
         Path(name).touch()
     assert files_of([str(tmp_path / "?.AT2")]) == names[:2]
-    assert files_of([names[2], "missing.AT2", "*.none"]) == [names[2], "missing.AT2", "*.none"]
+    assert files_of([names[2], "missing.AT2"]) == [names[2], "missing.AT2"]
+    with pytest.raises(ValueError, match=r"Pattern '\*.none' matches no file"):
+        files_of([names[2], "*.none"])
 
 
 def test_spectral_velocities_are_not_written_for_openquake(tmp_path, monkeypatch, capsys):
@@ -323,7 +350,7 @@ def test_spectrum(command, column, tmp_path):
     assert status == 0 and errors == ""
     assert (table["block sizes"], table["not computed"]) == ("5", "0")
     header, rows = table_of(tmp_path / "out" / "spectrum.csv")
-    assert header[0] == "two_pi_over_p_s" and len(header) == 6
+    assert header == ["two_pi_over_p_s", "rotation_ratio", "velocity_ratio", "impacts", "overturned", "margin"]
     np.testing.assert_allclose(rows[:, 0], [1, 1.75, 2.5, 3.25, 4])
     assert table["of these overturn"] == str(int(rows[:, 4].sum()))
     alpha = np.arctan(0.2)
@@ -356,10 +383,116 @@ def test_scenes_without_a_result_are_no_results(command, column, tmp_path, monke
     np.testing.assert_array_equal(np.isnan(rows).sum(axis=1), [5, 5, 0, 0, 0])
 
 
+def test_chaotic_scenes_are_results(command, column, tmp_path, monkeypatch):
+    """Their verdicts count, and their peaks are written."""
+    computed = rk.rocking_spectrum
+
+    def chaotic(*given):
+        result = computed(*given)
+        kinds = jax.vmap(lambda kind: rk.Status.where(True, rk.Status.chaotic, kind))(result.status)
+        return eqx.tree_at(lambda x: x.status, result, kinds)
+
+    monkeypatch.setattr(rk, "rocking_spectrum", chaotic)
+    status, table, errors = command("spectrum", column, *DESCRIBED, *FIVE)
+    assert status == 0 and errors == "" and table["not computed"] == "0"
+    _, rows = table_of(tmp_path / "out" / "spectrum.csv")
+    assert not np.isnan(rows).any()
+
+
+DESCRIBED = ("--dt", "0.02", "--unit", "cm/s2", "--restitution", "0.9", "--model", "linear")
+FIVE = ("--shortest", 1, "--longest", 4, "--points", 5)
+OF_AT2 = ("--restitution", "0.9", "--model", "linear", *FIVE)
+
+
+@pytest.fixture
+def records(tmp_path):
+    """Return a folder of three records, one in a folder of its own, with files that are none."""
+    folder = tmp_path / "records"
+    (folder / "inner").mkdir(parents=True)
+    for name, factor in (("a.AT2", 1.0), ("b.at2", 0.5), ("inner/c.AT2", 2.0)):
+        head, numbers = AT2.split("DT= .02 SEC\n")
+        rows = ("".join(f"{factor * float(x):15.7E}" for x in line.split()) for line in numbers.splitlines())
+        (folder / name).write_text(head + "DT= .02 SEC\n" + "\n".join(rows))
+    (folder / "README.md").write_text("no record")
+    (folder / ".hidden.AT2").write_text("no record")
+    return folder
+
+
+def rows_of(path):
+    """Return the header, and the rows by record, of the table of a suite."""
+    header, *rows = (line.split(",") for line in path.read_text().splitlines())
+    found = {}
+    for name, *numbers in rows:
+        found.setdefault(name, []).append([float(x) for x in numbers])
+    return header, {name: np.array(each) for name, each in found.items()}
+
+
+def test_spectra_of_several_records(command, records, tmp_path):
+    """A row a record and size, the same as each record's own table; one picture."""
+    given = (records, str(records / "inner" / "*.AT2"), records / "a.AT2")
+    status, table, errors = command("spectrum", *given, *OF_AT2)
+    assert status == 0 and errors == "" and table["title"] == "3 records"
+    assert (table["scenes"], table["files that could not be read"], table["not computed"]) == ("15", "0", "0")
+    assert table["files of folders without an ending of records"] == "1"
+    header, found = rows_of(tmp_path / "out" / "spectrum.csv")
+    assert header[:2] == ["record", "two_pi_over_p_s"] and list(found) == ["a.AT2", "b.at2", "c.AT2"]
+    assert is_figure(tmp_path / "out" / "spectrum.png")
+    lost = np.array([rows[:, 4] for rows in found.values()])
+    assert table["of these overturn"] == str(int(lost.sum()))
+    for name, rows in found.items():
+        (path,) = records.rglob(name)
+        status, *_ = command("spectrum", path, *OF_AT2)
+        _, own = table_of(tmp_path / "out" / "spectrum.csv")
+        assert status == 0
+        np.testing.assert_allclose(rows, own, rtol=1e-9)
+
+
+def test_a_file_that_cannot_be_read_is_named(command, capsys, records, column, tmp_path, undrawn):
+    """The others go on; a file without a unit, one of another unit than is said, and one that does not move count."""
+    (records / "still.csv").write_text("time [s],acceleration [g]\n" + "".join(f"{0.01 * k:g},0\n" for k in range(9)))
+    given = (records, column, records / "missing.AT2")
+    status, table, errors = command("spectrum", *given, *OF_AT2)
+    said = [line for line in errors.splitlines() if " was not read: " in line]
+    assert status == 1 and len(said) == 3 and table["title"] == "2 records"
+    assert table["files that could not be read"] == "3"
+    for name, reason in (
+        ("still.csv", "must move the ground"),
+        ("motion.csv", "but is not given"),
+        ("missing.AT2", "No such"),
+    ):
+        assert any(name in line and reason in line for line in said), said
+    _, found = rows_of(tmp_path / "out" / "spectrum.csv")
+    assert list(found) == ["a.AT2", "b.at2"]
+    status, table, errors = command("spectrum", records / "a.AT2", column, *DESCRIBED, *FIVE)
+    assert status == 1 and table["title"] == "1 records" and "a.AT2 was not read: " in errors and "'cm/s2'" in errors
+    for words, told in (
+        ((*given, "--strict"), "error: .*still.csv was not read: Argument"),
+        ((records / "README.md", records / "missing.AT2"), "error: None of 2 files could be read"),
+    ):
+        assert main([*map(str, ("spectrum", *words, *OF_AT2)), "--out", str(tmp_path / "other")]) == 2
+        printed = capsys.readouterr()
+        assert re.search(told, printed.err) and printed.out == "" and not (tmp_path / "other").exists()
+        assert "missing.AT2" not in printed.err or "None of" in told
+
+
+def test_records_with_one_name_are_told_apart_by_their_paths(command, records, tmp_path, undrawn):
+    (records / "inner" / "a.AT2").write_text((records / "inner" / "c.AT2").read_text())
+    given = (records / "a.AT2", records / "inner" / "a.AT2")
+    assert command("spectrum", *given, *OF_AT2)[0] == 0
+    _, found = rows_of(tmp_path / "out" / "spectrum.csv")
+    assert list(found) == [str(path) for path in given]
+
+
+def test_files_are_listed_once(records, monkeypatch):
+    monkeypatch.chdir(records)
+    assert each_once(files_of(["b.at2", ".", "./b.at2", "missing.AT2"])) == ["b.at2", "a.AT2", "missing.AT2"]
+    assert each_once(files_of(["inner/*", "*.AT2"])) == ["inner/c.AT2", "a.AT2"]
+
+
 def check_map(folder, points):
     """A map's file agrees with itself; return the states."""
     header, rows = table_of(folder / "map.csv")
-    assert header == ["frequency_ratio", "intensity", "state", "max_rotation_over_alpha", "impacts", "margin"]
+    assert header == ["frequency_ratio", "intensity", "state", "rotation_ratio", "impacts", "margin"]
     ratio, intensity, state, rotation, impacts, margin = rows.T
     assert rows.shape == (points**2, 6)
     np.testing.assert_allclose(np.unique(ratio), np.linspace(0.3, 8.0, points), rtol=1e-11)
@@ -437,7 +570,7 @@ def test_parameters_of_pulses_are_options():
 @pytest.mark.parametrize(
     "words, mentioned",
     [
-        ([], ["run", "spectrum", "map", "fragility", "examples:"]),
+        ([], ["run", "spectrum", "map", "critical", "fragility", "examples:"]),
         (["run"], ["--width", "--height", "--duration", "--dt", "--unit", "--column", "--scale", "--restitution"]),
         (["spectrum"], ["--slenderness", "--shortest", "--longest", "--points", "--model", "--out"]),
         (
@@ -454,9 +587,10 @@ def test_parameters_of_pulses_are_options():
                 "--uplift-strength",
             ],
         ),
+        (["critical"], ["--width", "--height", "--range", "--narrowest", "--dt", "--scale", "--restitution", "--out"]),
         (["invert"], ["--pulse", *PULSES, "--shape", "--amplitude", "--scatter", "--prior", "--starts", "--points"]),
     ],
-    ids=["jaxrock", "run", "spectrum", "map", "invert"],
+    ids=["jaxrock", "run", "spectrum", "map", "critical", "invert"],
 )
 @pytest.mark.parametrize("option", ["--help", "-h"])
 def test_help(capsys, words, mentioned, option):
@@ -501,6 +635,9 @@ BAD = {
     "fragility, levels": (["fragility", "a", "--levels", "2", "1"], "`--levels` must be positive, finite and in order"),
     "fragility, points 2": (["fragility", "a", "--points", "2"], "Argument `--points` must be at least 3, but is 2"),
     "spectrum, missing file": (["spectrum", "missing.AT2"], "No such file or directory"),
+    "spectrum, empty pattern": (["spectrum", "nothing*.AT2"], r"Pattern 'nothing\*.AT2' matches no file"),
+    "spectrum, empty folder": (["spectrum", "empty"], "Folder 'empty' holds no file with an ending of records: .acc"),
+    "fragility, empty folder": (["fragility", "empty"], "Folder 'empty' holds no file with an ending of records"),
     "spectrum, points 0": (["spectrum", "--points", "0"], "Argument `--points` must be at least 1, but is 0"),
     "spectrum, slenderness 0": (
         ["spectrum", "--slenderness", "0"],
@@ -514,6 +651,18 @@ BAD = {
         "must be positive, finite and in order, but is 0.5 to nan",
     ),
     "spectrum, longest inf": (["spectrum", "--longest", "inf"], "must be .*finite.*inf"),
+    "critical, missing file": (["critical", "missing.AT2"], "No such file or directory"),
+    "critical, width 0": (["critical", "--width", "0"], "Argument `--width` must be positive"),
+    "critical, restitution 2": (["critical", "--restitution", "2"], "Argument `--restitution` must be in"),
+    "critical, reversed": (["critical", "--range", "2", "1"], "`--range` must be positive, .* in order, but is 2 to 1"),
+    "critical, no range": (["critical", "--range", "2", "2"], "Argument `--range` must be rising, but is 2 to 2"),
+    "critical, range NaN": (["critical", "--range", "nan", "2"], "`--range` must be positive, finite"),
+    "critical, narrowest -1": (
+        ["critical", "--narrowest", "-1"],
+        "`--narrowest` must be 0 or more and finite, but is -1",
+    ),
+    "critical, narrowest NaN": (["critical", "--narrowest", "nan"], "`--narrowest` must be 0 or more and finite"),
+    "critical, still ground": (["critical", "--scale", "0"], "The record must move the ground, but its peak is 0 g"),
     "map, points 0": (["map", "--points", "0"], "Argument `--points` must be at least 2, but is 0"),
     "map, points 1": (["map", "--points", "1"], "Argument `--points` must be at least 2, but is 1"),
     "map, restitution 2": (["map", "--restitution", "2"], r"Argument `--restitution` must be in \[0, 1\], but is 2.0"),
@@ -555,6 +704,7 @@ def test_bad_input(tmp_path, monkeypatch, capsys, words, error):
     (tmp_path / "motion.txt").write_text("".join(f"{a}\n" for a in SAMPLES))
     (tmp_path / "words.txt").write_text("shaken, not stirred\n")
     (tmp_path / "rocks.csv").write_text(EXAMPLE)
+    (tmp_path / "empty").mkdir()
     monkeypatch.chdir(tmp_path)
     assert main(words) == 2
     printed = capsys.readouterr()

@@ -332,7 +332,7 @@ def test_a_few_at_once():
 
 
 @pytest.mark.parametrize(
-    "motion, most", [(rk.SinePulse(0.5, 1.0), 2500), (rk.example_record(), 2000)], ids=["pulse", "record"]
+    "motion, most", [(rk.SinePulse(0.5, 1.0), 2500), (rk.example_record(), 2600)], ids=["pulse", "record"]
 )
 def test_programs_are_small(motion, most):
     """Bound the operations that JAX traces, batches and differentiates of an outcome: a first answer waits for them."""

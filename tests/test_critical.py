@@ -61,7 +61,7 @@ def test_a_search_in_the_precision_of_its_margins(kind):
     def at(z, index):
         asked.append(z)
         margin = kind(30) * (kind(np.sqrt(0.5)) - z.astype(kind))
-        return margin, np.full_like(margin, -30), (margin < 0).astype(int)
+        return margin, np.full_like(margin, -30), (margin < 0).astype(int), np.zeros(z.shape, bool)
 
     found = ends.roots_of(at, ends.brackets_of(at, np.linspace(0, 1, 5)[None])[0])
     np.testing.assert_allclose(found["z"], [np.sqrt(0.5)], rtol=20 * np.finfo(kind).eps)
@@ -71,15 +71,18 @@ def test_a_search_in_the_precision_of_its_margins(kind):
 def test_what_is_not_known_is_no_end():
     """Beside a point without a result the verdict may change or not."""
     sides = [np.array([[0.0], [1.0]]), np.array([[-1.0], [1.0]]), np.ones((2, 1)), np.ones((2, 1), int)]
-    values = (np.array([0.5]), np.array([np.nan]), np.ones(1), np.ones(1, int))
-    *_, single, more = ends.halved(np, sides, values, np.array([6]))
-    assert not single.any() and not more.any()
+    sides.append(np.zeros((2, 1), bool))
+    for margin, is_open in ((np.nan, False), (0.5, True)):
+        values = (np.array([0.5]), np.array([margin]), np.ones(1), np.ones(1, int), np.array([is_open]))
+        *_, single, more = ends.halved(np, sides, values, np.array([6]))
+        assert not single.any() and not more.any()
 
 
 def ramp(z, numbers):
     """Margins that fall through zero at the root of one half, and are not known close to it, but for a point there."""
     margin = numbers.asarray(30 * (np.sqrt(0.5) - z))
-    return numbers.where((abs(margin) < 1e-4) & (abs(margin) > 1e-9), numbers.nan, margin), 0 * z - 30, 0 * z
+    margin = numbers.where((abs(margin) < 1e-4) & (abs(margin) > 1e-9), numbers.nan, margin)
+    return margin, 0 * z - 30, 0 * z, z < 0
 
 
 def test_points_on_the_way_to_an_end_that_are_not_known_are_told():

@@ -12,12 +12,12 @@ import pytest
 
 import jaxrock as rk
 from jaxrock.compiler import lane_function
+from jaxrock.engines.conclusion import has_one_peak
 from jaxrock.engines.taylor.expansion import End, Start, arrive, taylor_expansion
 from jaxrock.engines.taylor.policy import POLICY
 from jaxrock.motions.record import roomy
 from jaxrock.motions.shaking import Shaking
 from jaxrock.numerics.polynomial import jet
-from jaxrock.responses.outcome import has_one_peak
 from jaxrock.studies.sensitivities import _told
 from references.in_jaxrock import MODELS, PULSES
 from references.smooth_differences import gradient
@@ -688,6 +688,26 @@ def test_an_impact_at_the_end_of_the_motion():
 
 
 # ---- Sensitivities ----
+
+
+def test_there_are_no_slopes_beyond_the_time_at_which_errors_outgrow_the_rotation():
+    found = without_motion()
+    result, names, numbers = found.outcome, found.names[:-1], (found.values[:-1], jnp.asarray(0.2))
+    of_rows = jax.jit(functools.partial(_told, names, *numbers))
+    cases = {  # what the copies said; status of slopes of the peak, and of the margin
+        "known": ({"known_until": jnp.asarray(9.0)}, "useful", "useful"),
+        "chaotic": ({"status": rk.Status.chaotic, "differentiable": jnp.asarray(False)}, "useless", "useless"),
+        "a late peak": ({"known_until": jnp.asarray(4.0)}, "useless", "useless"),
+        "chaotic, overturned": ({"status": rk.Status.chaotic, "overturned": jnp.asarray(True)}, "missing", "useless"),
+        "open": ({"status": rk.Status.undecided, "known_until": jnp.asarray(4.0)}, "missing", "missing"),
+    }
+    like = {"time_of_max": jnp.asarray(5.0), "max_rotation": jnp.asarray(0.1), "differentiable": jnp.asarray(True)}
+    for name, (changes, *expected) in cases.items():
+        told = of_rows(np.full((4, 5), 0.1), dataclasses.replace(result, **(like | changes)))
+        for slopes, status in zip((told.max_rotation, told.margin), expected):
+            assert slopes.status == getattr(rk.studies.SlopeStatus, status), name
+            assert np.isnan(slopes.derivative).all() == (status != "useful")
+        assert bool(told.valid) == np.isfinite(told.boundary_distance) == (name == "known")
 
 
 def test_an_overturned_block_has_no_peak_to_differentiate():

@@ -404,7 +404,7 @@ def test_a_spectrum_leaves_out_what_was_not_computed():
 def test_a_spectrum_of_none_that_rocks_starts_at_zero(lost):
     peaks = jnp.full(2, jnp.inf if lost else 0.0)
     found = spectrum_of([lost, lost], [1.0, 2.0])
-    axes = rk.plot.spectrum(eqx.tree_at(lambda x: (x.max_rotation, x.max_velocity), found, (peaks, peaks)))
+    axes = rk.plot.spectrum(eqx.tree_at(lambda x: (x.rotation_ratio, x.velocity_ratio), found, (peaks, peaks)))
     assert [axis.get_ylim() for axis in axes] == [(0, 1)] * 2
     assert [text.get_text() for text in axes[0].texts] == ([] if lost else ["no block uplifts"])
 

@@ -13,6 +13,7 @@ import scipy.stats
 
 import jaxrock as rk
 from jaxrock.command_line.main import main
+from jaxrock.inverse.likelihood import _Scene
 from jaxrock.inverse.observation_files import _COLUMNS
 from jaxrock.inverse.observations import SEEN
 from jaxrock.inverse.posterior import _within
@@ -20,6 +21,7 @@ from jaxrock.inverse.profile_likelihood import shape_at
 from jaxrock.inverse.scatter import Possible, Quadrature, levels_around, rocks_at
 from jaxrock.inverse.unknowns import Evaluator, Problem, _batch
 from jaxrock.numerics.batched_bfgs import batched_bfgs
+from references import chaotic
 
 # All tests have twelve rocks and a sine pulse, so that they share one compiled program.
 ALPHA = np.array([0.10, 0.12, 0.14, 0.16, 0.18, 0.20, 0.22, 0.24, 0.26, 0.28, 0.31, 0.34])
@@ -233,6 +235,37 @@ def stands(scatter, critical, strength):
 
     slopes, found = jax.jacfwd(probabilities, has_aux=True)(scatter)
     return found, slopes
+
+
+def test_open_scenes_enter_with_their_share():
+    """Rocks stand in all scenes but one, in which chaos leaves the verdict open; without a share it is bridged."""
+    where, middle = np.linspace(-4, 4, 9)[:, None, None], 4
+
+    def topples(share):
+        y, known = np.full((9, 1, 1), 0.5), np.arange(9)[:, None, None] != middle
+        shares = np.where(known, np.nan, share)
+        found = Possible.of(*jax.device_put((where, y, 0 * y, known, y < 0, 0 * y + 1)), 1.0, jnp.asarray(shares))
+        return float(jnp.exp(found.log_probabilities()[1, 0])), found
+
+    half, one = scipy.stats.norm.cdf([0.5, 1.0]) - 0.5  # normal probability to each side, up to there
+    for share in (0.4, 0.9):
+        expected = 2 * share * (0.75 * half + 0.25 * (one - half))
+        assert topples(share)[0] == pytest.approx(expected, abs=3e-4)
+    assert topples(0.0)[0] == pytest.approx(2 * one / 64, rel=1e-2)  # half a copy
+    assert topples(np.nan)[0] < 1e-4 and np.all(topples(np.nan)[1].known)
+
+
+def test_chaotic_scenes_of_a_likelihood():
+    """A verdict that holds counts, without slopes of what is known only to its error; an open one has a share."""
+    samples, dt = chaotic.record("twice")
+    scene = _Scene(lambda stretch: rk.Record(samples, dt * stretch), rk.Housner(), None, ("stretch",))
+    level = np.log([1.378, 1.516, 0.3]) + np.log(np.abs(samples).max())
+    p = np.array([0.9755561453051129, 1.8891563520285026, 1.8891563520285026])
+    blocks = rk.Block(np.full(3, 0.24497866312686414), p, np.full(3, 0.9117647058823529))
+    rows, (real, lost, known, share) = jax.jit(scene.rows)(jnp.ones((3, 1)), jnp.asarray(level), jnp.ones(3), blocks)
+    np.testing.assert_array_equal(known, [True, False, True])
+    assert not lost[0] and real[0, 0] > 0 and not rows[0].any() and rows[2].any()
+    assert 0.1 < share[1] < 0.9 and np.isnan(share[np.array([0, 2])]).all()
 
 
 @pytest.mark.parametrize("what", ["rocks", "rocks and values", "the motion's function"])

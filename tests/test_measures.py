@@ -155,6 +155,13 @@ def test_bounds_and_too_few_records():
     found.verdict[:30] = -1
     lower, upper = (rk.hazard.compare_measures(found, ["PGV"], bound=each)["median"][0] for each in ("lower", "upper"))
     assert lower > upper
+    between = rk.hazard.compare_measures(found, ["PGV"], bound="share")
+    assert upper < between["median"][0] < lower
+    # The probability over pairs, of which an open scene is on both sides.
+    values, fell = found.table()["PGV"], np.where(found.verdict == -1, 0.5, found.verdict == 1).ravel()
+    pairs = fell[:, None] * (1 - fell)
+    larger = (values[:, None] > values) + (values[:, None] == values) / 2
+    assert between["auc"][0] == pytest.approx(np.sum(pairs * larger) / pairs.sum(), rel=1e-12)
     one = rk.motions.Suite([rk.SinePulse(0.5, 1.0)])
     blank, scale = np.zeros((1, 2, 1, 1)), np.array([1.0, 2.0])
     alone = rk.hazard.SuiteOutcomes(one, found.blocks, scale, (1,), blank.astype(np.int8), blank, blank)

@@ -347,7 +347,7 @@ def test_turned_round_a_block_does_as_with_its_ratios_exchanged():
         assert peak(make, law, 1) == pytest.approx(peak(make, law.mirrored, -1), rel=1e-13)
         assert abs(peak(make, law, 1) - peak(make, law, -1)) > 0.02
     block = rk.Block(0.2, 2.0, law)
-    ways = rk.hazard.suite_outcomes(block, [pulse], facing="both", progress=False, **QUICK).rotation.ravel()
+    ways = rk.hazard.suite_outcomes(block, [pulse], facing="both", progress=False, **QUICK).rotation_ratio.ravel()
     np.testing.assert_allclose(ways * 0.2, [peak(lambda law: rk.Block(0.2, 2.0, law), law, s) for s in (1, -1)])
 
 

@@ -29,6 +29,7 @@ WRITES = {
     "run --animate mp4": (("--animate", "mp4"), ("animation.mp4",)),
     "spectrum": ((), ("spectrum.csv", "spectrum.png")),
     "map": ((), ("map.csv", "map.png")),
+    "critical": ((), ("critical.csv", "critical.png")),
     "fragility": (("RECORD",), ("fragility.csv", "stripes.csv", "fragility.xml", "fragility.png")),
     "invert": (
         ("ROCKS",),
@@ -57,7 +58,7 @@ def out(tmp_path, monkeypatch):
 @pytest.fixture
 def nothing_computes(monkeypatch):
     """Let every long computation fail: a refusal must come before it."""
-    for name in ("simulate", "rocking_spectrum", "overturning_map"):
+    for name in ("simulate", "rocking_spectrum", "overturning_map", "critical_amplitudes"):
         monkeypatch.setattr(rk, name, lambda *_, **__: pytest.fail("computes"))
     monkeypatch.setattr(rk.hazard, "simulated_fragility", lambda *_, **__: pytest.fail("computes"))
     monkeypatch.setattr(rk.inverse, "estimate_motion", lambda *_, **__: pytest.fail("computes"))

@@ -28,7 +28,7 @@ def test_map_is_made_of_outcomes(surface):
     assert surface.state.shape == (17, 23)
     assert np.all(surface.status._value == rk.Status.successful._value)
     state, impacts, margin, rotation = map(
-        np.asarray, (surface.state, surface.impact_count, surface.margin, surface.max_rotation)
+        np.asarray, (surface.state, surface.impact_count, surface.margin, surface.rotation_ratio)
     )
     for i in range(0, 17, 3):
         for j in range(0, 23, 4):
@@ -73,8 +73,8 @@ def test_self_similar_spectrum():
     """In the linear model rotation/alpha depends on intensity and frequency ratio alone."""
     ratio, intensity = np.array([4.0, 8.0, 16.0]), [1.5, 3.0]
     a, b = (rk.studies.self_similar_spectrum(ratio, intensity, alpha=alpha, **LINEAR) for alpha in (0.05, 0.3))
-    assert a.max_rotation.shape == (2, 3)
-    np.testing.assert_allclose(a.max_rotation, b.max_rotation, rtol=1e-13)
+    assert a.rotation_ratio.shape == (2, 3)
+    np.testing.assert_allclose(a.rotation_ratio, b.rotation_ratio, rtol=1e-13)
     np.testing.assert_allclose(a.margin, b.margin, rtol=1e-12)
 
 
@@ -86,7 +86,7 @@ def test_rocking_spectrum_of_a_record():
     spectrum = rk.rocking_spectrum(alpha, record, period, **QUICK)
     assert np.all(spectrum.status._value == rk.Status.successful._value)
     np.testing.assert_array_equal(spectrum.overturned, [True, True, False, False, False])
-    rotation, velocity = np.asarray(spectrum.max_rotation), np.asarray(spectrum.max_velocity)
+    rotation, velocity = np.asarray(spectrum.rotation_ratio), np.asarray(spectrum.velocity_ratio)
     for i in (1, 2, 4):
         p = 2 * np.pi / period[i]
         single = rk.outcome(rk.Block(alpha, p), record, QUICK["model"], engine=QUICK["engine"])
@@ -112,7 +112,7 @@ def test_single_lobes_over_strength_duration_and_shape(lobes):
     assert 0.2 < np.mean(strength < wall) < 0.8
     for found in lobes:
         np.testing.assert_array_equal(np.asarray(found.margin) < 0, strength < wall)
-        np.testing.assert_allclose(found.max_rotation, peak, rtol=1e-11)
+        np.testing.assert_allclose(found.rotation_ratio, peak, rtol=1e-11)
         np.testing.assert_allclose(found.uplift_strength, STRENGTHS, rtol=1e-15)
         np.testing.assert_allclose(found.pulse_duration, DURATIONS, rtol=1e-15)
         np.testing.assert_array_equal(found.parameters["shape"], SHAPES)
@@ -197,9 +197,9 @@ TRACED = {
             **QUICK,
         ).margin
     ),
-    "spectrum": lambda a: rk.rocking_spectrum(0.2, a * rk.SinePulse(1.5, 0.8), PERIODS, **QUICK).max_rotation,
+    "spectrum": lambda a: rk.rocking_spectrum(0.2, a * rk.SinePulse(1.5, 0.8), PERIODS, **QUICK).rotation_ratio,
     "self-similar spectrum": lambda alpha: (
-        rk.studies.self_similar_spectrum(FEW_RATIOS + 5, FEW_INTENSITIES, alpha=alpha, **QUICK).max_rotation
+        rk.studies.self_similar_spectrum(FEW_RATIOS + 5, FEW_INTENSITIES, alpha=alpha, **QUICK).rotation_ratio
     ),
 }
 
@@ -309,7 +309,7 @@ def test_slopes_beside_a_point_that_overturns():
     def peaks(alpha):
         spectrum = rk.rocking_spectrum(alpha, motion, periods, **QUICK)
         surface = rk.overturning_map([2.0, 4.0], [1.2, 3.0], alpha=alpha, **QUICK)
-        return jnp.concatenate([spectrum.max_rotation, spectrum.max_velocity, surface.max_rotation.ravel()])
+        return jnp.concatenate([spectrum.rotation_ratio, spectrum.velocity_ratio, surface.rotation_ratio.ravel()])
 
     at = 0.3
     found, above, below = (np.asarray(peaks(alpha)) for alpha in (at, at + 1e-6, at - 1e-6))
@@ -332,4 +332,4 @@ def test_numbers_of_single_precision_are_as_exact_as_they_are():
     )
     for a, b in zip(exact, single):
         np.testing.assert_array_equal(a.margin, b.margin)
-        np.testing.assert_array_equal(a.max_rotation, b.max_rotation)
+        np.testing.assert_array_equal(a.rotation_ratio, b.rotation_ratio)

@@ -12,7 +12,7 @@ DECIDED = {"by a higher order": (0.26030150753768844, True), "by nothing": (0.27
 
 def test_no_setting_is_said_to_decide_all():
     text = rk.Status[rk.Status.undecided]
-    assert "may decide; where a chaotic tail makes rounding grow as large, no setting of an engine decides." in text
+    assert "may decide; where chaotic rocking makes rounding grow as large, no setting of an engine decides." in text
 
 
 @pytest.mark.slow

@@ -187,7 +187,7 @@ def test_outcomes_come_back(tmp_path):
 def _outcome(k):
     x = 1.0 * k
     status = rk.Status.where(k == 1, rk.Status.undecided, rk.Status.successful)
-    return rk.responses.Outcome(x, x, x, k, x > 0, x, x > 0, x, x, status)
+    return rk.responses.Outcome(x, x, x, k, k, x > 0, x, x, x > 0, x, x, x, status)
 
 
 def test_another_ending_is_refused():

@@ -46,7 +46,7 @@ def test_every_scene_is_one_of_its_own(found):
             alone = rk.outcome(rock, float(found.facing[f] * SCALE[s]) * motion, **QUICK)
             assert found.verdict[m, s, f, b] == int(alone.overturned)
             rotation = float(alone.max_rotation) / min(float(rock.alpha1), float(rock.alpha2))
-            assert found.rotation[m, s, f, b] == pytest.approx(rotation, rel=1e-9)
+            assert found.rotation_ratio[m, s, f, b] == pytest.approx(rotation, rel=1e-9)
             assert found.margin[m, s, f, b] == pytest.approx(float(alone.margin), rel=1e-7)
 
 
@@ -64,7 +64,7 @@ def test_turning_round_a_symmetric_block_changes_nothing():
     np.testing.assert_array_equal(found.verdict[:, :, 0], found.verdict[:, :, 1])
     turned = [rk.Record(-m.samples, m.dt) for m in RECORDS[:2]]
     turned = rk.hazard.suite_outcomes(rk.Block(0.2, 2.5), turned, facing="both", progress=False, **QUICK)
-    np.testing.assert_allclose(turned.rotation[:, 0, 0, 0], found.rotation[:, 0, 1, 0], rtol=1e-9)
+    np.testing.assert_allclose(turned.rotation_ratio[:, 0, 0, 0], found.rotation_ratio[:, 0, 1, 0], rtol=1e-9)
 
 
 class Tabulated(rk.restitution.AbstractRestitution):

@@ -15,6 +15,7 @@ import jaxrock as rk
 from jaxrock.hazard.intervals import intervals_of_motions
 from jaxrock.hazard.surfaces import _verdict
 from jaxrock.motions.suite import repeated
+from references import chaotic
 
 G = 9.81
 RICKER_TOP = np.sqrt((3 - np.sqrt(6)) * 6) * np.exp(-(3 - np.sqrt(6)) / 2)  # of |y^3 - 3y| e^(-y^2/2)
@@ -155,7 +156,7 @@ def test_a_surface_of_what_is_made_of_samples():
     """Each period has a record of its own: a scene is of one of them (it is traced only)."""
     group = jax.vmap(lambda t: rk.Record([0.0, 0.3, 0.0], t))(jnp.array([0.4, 0.5]))
     scene = rk.Block(np.array([0.2]), np.array([2.0])), group, rk.Linear(), rk.Series(order=4)
-    assert jax.eval_shape(_verdict, 0, 0, 1.0, scene).shape == ()
+    assert [each.shape for each in jax.eval_shape(_verdict, 0, 0, 1.0, scene)] == [(), ()]
 
 
 def test_draws_of_two_sides():
@@ -206,7 +207,7 @@ def test_what_is_undecided_bounds_the_probability():
     np.testing.assert_allclose(found.upper, [0, 2 / 4, 4 / 4])
     for use in (found.fit, found.tabulated, found.counts):
         with pytest.raises(
-            ValueError, match="`bound` must be 'lower' or 'upper', because 2 of 12 scenes are undecided"
+            ValueError, match="`bound` must be 'lower', 'upper' or 'share', because 2 of 12 scenes are undecided"
         ):
             use()
     np.testing.assert_allclose(found.tabulated("upper").probabilities, found.upper)
@@ -215,6 +216,37 @@ def test_what_is_undecided_bounds_the_probability():
     np.testing.assert_array_equal(found.table()["toppled"], [0, 1, 2, 0, 0, 1])
     # The second block of the first motion may have toppled at level 2, but did so at 3.
     np.testing.assert_allclose(found.capacities[0], [[1, 2], [1, 3]])
+
+
+def test_open_scenes_count_by_the_share_that_topples():
+    verdict = [[[0, 0], [1, -1], [1, 1]], [[0, 0], [0, 0], [-1, 1]]]
+    share = np.where(np.equal(verdict, -1), [[[0.25]], [[0.75]]], verdict)
+    known = dataclasses.replace(table(verdict), share=share)
+    np.testing.assert_array_equal(known.counts("share"), [[0, 1.25, 2], [0, 0, 1.75]])
+    np.testing.assert_allclose(known.tabulated("share").probabilities, [0, 1.25 / 4, 3.75 / 4])
+    np.testing.assert_array_equal(table(verdict).counts("share"), [[0, 1.5, 2], [0, 0, 1.5]])
+    assert float(known.fit("share").fragility.median) < float(known.fit("lower").fragility.median)
+    levels, ratio = jax.device_put((np.arange(1.0, 4), np.array([1.0, 2.0])))
+    verdict, share = (np.swapaxes(x, 0, 1)[None] for x in (verdict, share))
+    surface = rk.hazard.SimulatedSurface(levels, ratio, verdict.astype(np.int8))
+    with pytest.raises(ValueError, match="2 of 12"):
+        surface.fit()
+    fits = [dataclasses.replace(surface, share=each).fit("share") for each in (None, share)]
+    assert float(fits[0].fragility.median) != float(fits[1].fragility.median)
+
+
+OPEN = {"alpha": 0.24497866312686414, "p": 1.8891563520285026, "restitution": 0.9117647058823529}
+
+
+def test_shares_of_simulated_scenes():
+    """Chaos leaves the verdict under one record open (`references.chaotic`); 7 of 17 motions overturn."""
+    motion = rk.Record(*chaotic.record("twice"))
+    peak = float(rk.intensity.peak_acceleration(motion))
+    levels = peak * np.array([0.1, 1.516])
+    found = rk.hazard.simulated_fragility(rk.Block(**OPEN), [motion], levels, progress=False)
+    np.testing.assert_array_equal(found.verdict.ravel(), [0, -1])
+    assert found.share.shape == found.verdict.shape and found.share[0, 0, 0] == 0
+    assert 0.1 < found.share[0, 1, 0] < 0.9 and found.counts("share")[0, 1] == found.share[0, 1, 0]
 
 
 def test_what_stands_again_is_not_made_to_topple():
@@ -477,6 +509,11 @@ def test_fit_of_a_simulated_surface():
         found.fit()
     axis = rk.plot.fragility_surface(found, fit.fragility)
     assert axis.get_xlabel() == "PGV/PGA [s]" and len(axis.lines) == 3
+    shown = [np.array(axis.collections[0].get_array()).ravel()]
+    known = dataclasses.replace(found, share=np.where(verdict == -1, 0.9, verdict == 1))
+    shown.append(np.array(rk.plot.fragility_surface(known).collections[0].get_array()).ravel())
+    changed = np.abs(shown[1] - shown[0])
+    assert np.count_nonzero(changed) == 1 and changed.max() == pytest.approx(0.4 / verdict.shape[-1])
 
 
 def test_figure_of_a_fragility():

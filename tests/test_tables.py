@@ -33,26 +33,33 @@ SENSITIVITY = made(
 
 TABLES = {
     "spectrum": made(
-        rk.studies.Spectrum, abscissa=np.array([1.0, 2.0, 3.0]), max_rotation=np.arange(3.0),
-        max_velocity=np.ones(3), impact_count=np.arange(3), overturned=np.zeros(3, bool),
+        rk.studies.Spectrum, abscissa=np.array([1.0, 2.0, 3.0]), rotation_ratio=np.arange(3.0),
+        velocity_ratio=np.ones(3), impact_count=np.arange(3), overturned=np.zeros(3, bool),
         margin=np.ones(3), status=STATUS, intensity=None,
-        parameters={},
+        parameters={}, motions=None,
+    ),
+    "spectrum of a suite": made(
+        rk.studies.Spectrum, abscissa=np.array([1.0, 2.0, 3.0]), rotation_ratio=np.ones((2, 3)),
+        velocity_ratio=np.ones((2, 3)), impact_count=np.ones((2, 3)), overturned=np.zeros((2, 3), bool),
+        margin=np.ones((2, 3)), status=jax.tree.map(lambda x: np.tile(x, (2, 1)), STATUS), intensity=None,
+        parameters={}, motions=("one", "two"),
     ),
     "self-similar spectrum": made(
-        rk.studies.Spectrum, abscissa=np.array([1.0, 2.0, 3.0]), max_rotation=np.ones((2, 1, 3)),
-        max_velocity=np.ones((2, 1, 3)), impact_count=np.ones((2, 1, 3)), overturned=np.zeros((2, 1, 3), bool),
+        rk.studies.Spectrum, abscissa=np.array([1.0, 2.0, 3.0]), rotation_ratio=np.ones((2, 1, 3)),
+        velocity_ratio=np.ones((2, 1, 3)), impact_count=np.ones((2, 1, 3)), overturned=np.zeros((2, 1, 3), bool),
         margin=np.ones((2, 1, 3)), status=jax.tree.map(lambda x: np.tile(x, (2, 1, 1)), STATUS),
-        intensity=np.array([1.5]), parameters={"shape": np.array([0.0, 1.0])},
+        intensity=np.array([1.5]), parameters={"shape": np.array([0.0, 1.0])}, motions=None,
     ),
     "map": made(
         rk.studies.OverturningMap, frequency_ratio=np.array([1.0, 2.0, 3.0]), intensity=np.array([2.0]),
-        state=np.ones((1, 3)), max_rotation=np.ones((1, 3)), impact_count=np.ones((1, 3)), margin=np.ones((1, 3)),
+        state=np.ones((1, 3)), rotation_ratio=np.ones((1, 3)), impact_count=np.ones((1, 3)), margin=np.ones((1, 3)),
         status=jax.tree.map(lambda x: x[None], STATUS), parameters={},
     ),
     "critical amplitudes": made(
         rk.studies.Critical, count=np.array([2]), value=np.ones((1, 2)), intensity=np.ones((1, 2)),
         rising=np.ones((1, 2)), impacts=np.ones((1, 2)), balanced=np.ones((1, 2)), derivative=np.ones((1, 2, 1)),
-        complete=np.array([True]), from_the_least=np.array([False]), names=("alpha",),
+        complete=np.array([True]), from_the_least=np.array([False]), names=("alpha",), scale=np.ones((1, 2)),
+        merged=np.array([1]),
     ),
     "fragility intervals": rk.hazard.fragility_intervals([0.2, 0.3, 0.4, 0.5], [0, 1, 0, 1]),
     "estimate": made(
@@ -78,8 +85,9 @@ TABLES = {
     ),
     "outcomes": made(
         rk.responses.Outcome, max_rotation=np.ones(3), max_velocity=np.ones(3), time_of_max=np.ones(3),
-        impact_count=np.arange(3), overturned=np.zeros(3, bool), margin=np.ones(3),
-        differentiable=np.ones(3, bool), clearance=np.ones(3), error=np.ones(3), status=STATUS,
+        impact_count=np.arange(3), large_impact_count=np.arange(3), overturned=np.zeros(3, bool),
+        overturned_share=np.zeros(3), margin=np.ones(3), differentiable=np.ones(3, bool), clearance=np.ones(3),
+        error=np.ones(3), known_until=np.ones(3), status=STATUS,
     ),
     "outcome of a column": made(
         rk.responses.FlexibleOutcome, max_rotation=ONE, max_displacement=ONE, max_bending=ONE, impact_count=ONE,
@@ -102,7 +110,7 @@ TABLES = {
     ),
     "suite": made(
         rk.hazard.SuiteOutcomes, suite=made(rk.motions.Suite, names=("one", "two")), facing=(1, -1),
-        scale=np.array([1.0, 2.0, 3.0]), verdict=np.zeros((2, 3, 2, 4), np.int8), rotation=np.ones((2, 3, 2, 4)),
+        scale=np.array([1.0, 2.0, 3.0]), verdict=np.zeros((2, 3, 2, 4), np.int8), rotation_ratio=np.ones((2, 3, 2, 4)),
         margin=np.ones((2, 3, 2, 4)),
     ),
     "simulated fragility": made(
@@ -111,7 +119,7 @@ TABLES = {
     ),
     "azimuths": made(
         rk.studies.AzimuthOutcomes, azimuth=np.arange(3.0), scale=np.array([1.0, 2.0]),
-        verdict=np.zeros((3, 2), np.int8), rotation=np.ones((3, 2)), margin=np.ones((3, 2)),
+        verdict=np.zeros((3, 2), np.int8), rotation_ratio=np.ones((3, 2)), margin=np.ones((3, 2)),
     ),
     "fragility": made(
         rk.hazard.FragilityFit, fragility=rk.hazard.LogNormalFragility(0.3, 0.4), covariance=np.eye(2),

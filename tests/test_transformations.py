@@ -433,7 +433,7 @@ def test_a_history_is_pickled_by_the_function_that_it_is_of():
     nameless = rk.models.Equation(lambda rotation, block: jnp.sin(block.alpha - rotation), arm)
     for model in (nameless, rk.models.Equation(restoring, arm)):
         found = rk.simulate(BLOCK, PULSE, model, samples=9)
-    np.testing.assert_array_equal(pickle.loads(pickle.dumps(found)).rotation, found.rotation)
+    np.testing.assert_array_equal(pickle.loads(pickle.dumps(found)).rotation_ratio, found.rotation_ratio)
 
 
 @pytest.mark.slow

@@ -24,7 +24,7 @@ def surface(problem, engine):
         )
         for restitution in problem.restitutions
     ]  # fmt: skip
-    return np.concatenate([np.where(m.status == rk.Status.successful, m.max_rotation, np.nan).ravel() for m in maps])
+    return np.concatenate([np.where(m.status == rk.Status.successful, m.rotation_ratio, np.nan).ravel() for m in maps])
 
 
 def under_record(problem, engine):

@@ -23,7 +23,9 @@ from jaxrock.command_line.results import ResultFolder
 
 
 def _add_options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("records", nargs="+", metavar="RECORD", help="files of accelerograms, of any format")
+    parser.add_argument(
+        "records", nargs="+", metavar="RECORD", help="files of accelerograms of any format, folders, patterns"
+    )
     parser.add_argument("--width", type=plain_float, default=0.6, help="full width [m] (default 0.6)")
     parser.add_argument("--height", type=plain_float, default=3.0, help="full height [m] (default 3)")
     parser.add_argument(
@@ -53,7 +55,7 @@ def _run(arguments: argparse.Namespace, report: Report) -> None:
         block = rk.blocks.draw_blocks(block, arguments.draws, alpha=arguments.scatter)
     levels = np.geomspace(*arguments.levels, arguments.points)
     found = rk.hazard.simulated_fragility(block, suite, levels, model_of(arguments), measure=arguments.measure.upper())
-    fits = {bound: found.fit(bound) for bound in ("lower", "upper")}
+    fits = {bound: found.fit(bound) for bound in ("lower", "upper", "share")}
     report.title(f"{len(suite)} records")
     report.table(_entries(found, fits))
     good = all(fit.status == rk.hazard.FitStatus.successful for fit in fits.values())
@@ -73,10 +75,10 @@ def _entries(found: rk.hazard.SimulatedFragility, fits: dict) -> list[Entry]:
         Entry("stand_again", "pairs of motion and block that stand again at a higher level", again),
     ]
     for bound, fit in fits.items():
-        if bound == "upper" and not found.undecided:
+        if bound != "lower" and not found.undecided:
             continue
         errors = np.sqrt(np.diag(np.asarray(fit.covariance)))
-        counted = {"lower": "standing", "upper": "toppled"}[bound]
+        counted = {"lower": "standing", "upper": "toppled", "share": "shares"}[bound]
         words, key = ("", "") if not found.undecided else (f", undecided as {counted}", f"_{bound}")
         said = "standard errors of their logarithms"
         known = f"{errors[0]:.3f}, {errors[1]:.3f}" if np.isfinite(errors).all() else "not known"  # one record has none

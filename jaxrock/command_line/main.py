@@ -1,4 +1,4 @@
-"""The command line: responses, spectra, overturning maps, fragilities, and motions that rocks allow."""
+"""The command line: responses, spectra, overturning maps, critical scales, fragilities, motions that rocks allow."""
 
 import argparse
 import contextlib
@@ -12,6 +12,7 @@ import jax
 
 from jaxrock.command_line.cache import CACHE
 from jaxrock.command_line.command import Command
+from jaxrock.command_line.critical import CRITICAL
 from jaxrock.command_line.fragility import FRAGILITY
 from jaxrock.command_line.invert import INVERT
 from jaxrock.command_line.map import MAP
@@ -25,7 +26,7 @@ from jaxrock.compiler import cache
 from jaxrock.sweeps.devices import use_cpu_devices
 
 # To add a command, write a module like `run` and add it here.
-_COMMANDS = {command.name: command for command in (RUN, SPECTRUM, MAP, FRAGILITY, INVERT, CACHE)}
+_COMMANDS = {command.name: command for command in (RUN, SPECTRUM, MAP, CRITICAL, FRAGILITY, INVERT, CACHE)}
 
 _EXAMPLES = """\
   jaxrock run                                     a 0.6 m x 3 m block under the built-in 1979 record
@@ -33,7 +34,9 @@ _EXAMPLES = """\
   jaxrock run data.csv --dt 0.01 --unit cm/s2     a column of numbers
   jaxrock run --animate                           and a film of it, animation.gif
   jaxrock spectrum motion.AT2 --slenderness 5     blocks of height/width 5, every size
+  jaxrock spectrum motions/*.AT2                  a suite: every record, the median and 16 to 84 %
   jaxrock map --pulse cosine --points 200         who overturns under a pulse
+  jaxrock critical motion.AT2 --narrowest 1e-3    scales of a record at which a block topples and stands again
   jaxrock fragility motions/*.AT2 --width 0.5     how probable it is that a block topples
   jaxrock invert --example > rocks.csv            a table of rocks, to be filled with yours
   jaxrock invert rocks.csv --scatter 0.2          what motion rocks that stand or fell allow

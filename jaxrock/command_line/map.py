@@ -58,8 +58,8 @@ def _run(arguments: argparse.Namespace, report: Report) -> None:
     counts = {name: int((state == key).sum()) for key, name in names.items()}
     report.table([Entry(name.replace(" ", "_"), name, count, unit="scenes") for name, count in counts.items()])
     columns, rows = np.meshgrid(*axes.values())
-    write_table(report, arguments.out, "map.csv", ",".join(axes) + ",state,max_rotation_over_alpha,impacts,margin",
-              *(np.ravel(x) for x in (columns, rows, state, result.max_rotation, result.impact_count, result.margin)),
+    write_table(report, arguments.out, "map.csv", ",".join(axes) + ",state,rotation_ratio,impacts,margin",
+              *(np.ravel(x) for x in (columns, rows, state, result.rotation_ratio, result.impact_count, result.margin)),
               )  # fmt: skip
     exact = False if arguments.pixels else None
     save(report, arguments.out, "map.png", rk.plot.overturning(result, by_duration=by_duration, exact=exact).figure)

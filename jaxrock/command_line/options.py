@@ -2,6 +2,7 @@
 
 import argparse
 import glob
+import os
 import re
 from collections.abc import Callable
 from functools import partial
@@ -10,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import jaxrock as rk
+from jaxrock.motions.files.reading import FORMATS
 from jaxrock.motions.pulses import PULSES
 from jaxrock.motions.pulses.pulse import AbstractPulse
 
@@ -22,6 +24,11 @@ def plain_float(text: str) -> float:
 
 
 plain_float.__name__ = "number"  # in messages of argparse
+
+_KINDS = "PEER AT2, CSMIP V1 or V2, COSMOS, ESM, SMC, K-NET, CSV or text file"
+_ENDINGS = tuple(
+    sorted({*(x for each in FORMATS.values() for x in each.suffixes), ".acc", ".asc", ".csv", ".dat", ".txt"})
+)
 
 
 def model_of(arguments: argparse.Namespace) -> rk.models.AbstractEquation:
@@ -38,21 +45,70 @@ def add_restitution(parser: argparse.ArgumentParser) -> None:
 
 def add_record(parser: argparse.ArgumentParser) -> None:
     """Add the record, and options for files that lack time step, unit or column."""
-    parser.add_argument(
-        "record",
-        nargs="?",
-        help="PEER AT2, CSMIP V1 or V2, COSMOS, ESM, SMC, K-NET, CSV or text file (default: the built-in record)",
-    )
+    parser.add_argument("record", nargs="?", help=f"{_KINDS} (default: the built-in record)")
+    _add_description_and_scale(parser)
+
+
+def add_records(parser: argparse.ArgumentParser) -> None:
+    """Add any number of records, and options for files that lack time step, unit or column."""
+    words = f"files, folders or patterns: {_KINDS} (default: the built-in record)"
+    parser.add_argument("records", nargs="*", metavar="RECORD", help=words)
+    parser.add_argument("--strict", action="store_true", help="stop at the first file that cannot be read")
+    _add_description_and_scale(parser)
+
+
+def _add_description_and_scale(parser: argparse.ArgumentParser) -> None:
     add_description(parser)
     parser.add_argument("--scale", type=plain_float, default=1.0, help="factor on the acceleration (default 1)")
 
 
 def files_of(words: list[str]) -> list[str]:
-    """Return the files, with patterns expanded and sorted, because shells of Windows do not expand patterns."""
-    found = []
+    """Return the files, with patterns and folders expanded and sorted.
+
+    Shells of Windows do not expand patterns. Of a folder it takes the files with endings of records, without those of
+    its folders.
+
+    **Raises:** ValueError for a pattern that matches no file, and a folder without such files.
+    """
+    found: list[str] = []
     for word in words:
-        found += ([] if Path(word).exists() else sorted(glob.glob(word))) or [word]
+        path = Path(word).expanduser()
+        if path.is_dir():
+            found += _files_in(path)
+        elif path.exists() or not glob.has_magic(word):
+            found.append(word)
+        else:
+            names = sorted(name for name in glob.glob(str(path)) if not Path(name).is_dir())
+            if not names:
+                raise ValueError(f"Pattern {word!r} matches no file.")
+            found += names
     return found
+
+
+def each_once(files: list[str]) -> list[str]:
+    """Return the files without those that are there before, also by another path."""
+    once: dict[str, str] = {}
+    for name in files:
+        once.setdefault(os.path.realpath(Path(name).expanduser()), name)
+    return list(once.values())
+
+
+def _files_in(folder: Path) -> list[str]:
+    """Return the files of a folder that have endings of records, sorted."""
+    files = [str(path) for path in _visible_in(folder) if path.suffix.lower() in _ENDINGS]
+    if not files:
+        raise ValueError(f"Folder {str(folder)!r} holds no file with an ending of records: {', '.join(_ENDINGS)}.")
+    return files
+
+
+def left_out_of_folders(words: list[str]) -> int:
+    """Return the number of files, without hidden ones, that `files_of` leaves out of folders for their endings."""
+    folders = {os.path.realpath(path) for path in (Path(word).expanduser() for word in words) if path.is_dir()}
+    return sum(path.suffix.lower() not in _ENDINGS for folder in folders for path in _visible_in(Path(folder)))
+
+
+def _visible_in(folder: Path) -> list[Path]:
+    return [path for path in sorted(folder.iterdir()) if not path.name.startswith(".") and not path.is_dir()]
 
 
 def add_description(parser: argparse.ArgumentParser) -> None:
@@ -73,13 +129,18 @@ def file_description(arguments: argparse.Namespace) -> dict:
 
 def record_of(arguments: argparse.Namespace) -> rk.Record:
     """Return the chosen record, scaled."""
-    if arguments.record is None:
+    return scaled_record(arguments.record, arguments)
+
+
+def scaled_record(path: str | None, arguments: argparse.Namespace) -> rk.Record:
+    """Return the record of a file, or the built-in one, scaled."""
+    if path is None:
         for option in _OF_FILES:
             if getattr(arguments, option) is not None:
                 raise ValueError(f"Option --{option} describes a file, but no RECORD is given.")
         record = rk.example_record()
     else:
-        record = rk.read_record(arguments.record, **file_description(arguments))
+        record = rk.read_record(path, **file_description(arguments))
     if not abs(arguments.scale) < float("inf"):
         raise ValueError(f"Argument `--scale` must be finite, but is {arguments.scale:g}.")
     return rk.processing.scaled(record, arguments.scale)
@@ -139,7 +200,7 @@ _POSITIONAL = {"command", *_INPUTS}
 def inputs_of(arguments: argparse.Namespace) -> list[Path]:
     """Return the files that a command reads."""
     words = [getattr(arguments, name, None) or [] for name in _INPUTS]
-    return [Path(path).expanduser() for each in words for path in files_of([each] if isinstance(each, str) else each)]
+    return [Path(path).expanduser() for each in words for path in ([each] if isinstance(each, str) else files_of(each))]
 
 
 def as_typed(message: str, arguments: argparse.Namespace) -> str:

@@ -1,6 +1,7 @@
 """Output of commands: aligned tables for people or one JSON object for programs, CSV files, figures."""
 
 import contextlib
+import csv
 import json
 import logging
 import os
@@ -13,6 +14,7 @@ import numpy as np
 import jaxrock as rk
 from jaxrock._arguments.tables import items_of
 from jaxrock.command_line.results import ResultFolder
+from jaxrock.status import is_decided
 
 
 class Entry(NamedTuple):
@@ -143,6 +145,16 @@ def write_table(report: Report, folder: ResultFolder, name: str, header: str, *c
     report.wrote(folder.path / name)
 
 
+def write_named_table(report: Report, folder: ResultFolder, name: str, header: str, names, *columns) -> None:
+    """Write a column of names, and columns of numbers, under a comma-separated header."""
+    with folder.whole(name) as aside, aside.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(header.split(","))
+        for label, *numbers in zip(names, *(np.asarray(column, dtype=float) for column in columns)):
+            writer.writerow([label, *(f"{number:.12g}" for number in numbers)])
+    report.wrote(folder.path / name)
+
+
 def save(report: Report, folder: ResultFolder, name: str, figure) -> None:
     """Write a figure."""
     with folder.whole(name) as aside:
@@ -155,7 +167,7 @@ def check_surface(report: Report, status: rk.Status) -> None:
     for word in items_of(status):
         kind = getattr(rk.Status, word)
         count = int(np.sum(np.asarray(status == kind)))
-        if count and word != "successful":
+        if count and not is_decided(kind):
             report.failed(f"{count} scenes were not computed: {rk.Status[kind]}")
 
 

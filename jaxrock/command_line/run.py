@@ -9,6 +9,7 @@ from jaxrock.command_line.command import Command
 from jaxrock.command_line.options import add_record, add_restitution, model_of, plain_float, record_of
 from jaxrock.command_line.output import Entry, Report, save, write_table
 from jaxrock.command_line.results import ResultFolder
+from jaxrock.status import is_decided
 
 _FILMS = ("gif", "html", "mp4")
 
@@ -45,9 +46,18 @@ def _run(arguments: argparse.Namespace, report: Report) -> None:
     _write(report, arguments.out, response)
     if arguments.animate:
         _film(report, arguments.out, _film_of(arguments.animate), response, block)
-    for status in (response.status, result.status):
-        if status != rk.Status.successful:
+    _say_what_is_known(report, result, response)
+
+
+def _say_what_is_known(report: Report, result: rk.responses.Outcome, response: rk.responses.Response) -> None:
+    """Report a failure where the numbers are not results, and say what chaotic rocking leaves unknown."""
+    # The verdict of the history is that of the outcome, which tells more.
+    failed = not (is_decided(response.status) or response.status == rk.Status.undecided)
+    for status, lost in ((response.status, failed), (result.status, not is_decided(result.status))):
+        if lost:
             return report.failed(f"these are not results: {rk.Status[status]}")
+    if result.status == rk.Status.chaotic:
+        report.say(rk.Status[result.status])
 
 
 def _entries(
@@ -72,22 +82,45 @@ def _entries(
         Entry("p", "frequency parameter p", float(block.p), ".4f", "rad/s"),
         Entry("restitution", "restitution", float(block.restitution), ".4f"),
         Entry("uplift_threshold", "uplift threshold", float(model.moments(block).threshold), ".4f", "g"),
-        *_impacts(int(result.impact_count), len(response.impact_times), float(response.duration)),
+        *_impacts(result, len(response.impact_times), float(response.duration)),
         Entry("peak_rotation", "peak rotation", unless_lost(result.max_rotation), ".6f", "rad", instead),
         Entry("peak_rotation_over_alpha", "peak rotation / alpha", unless_lost(ratio), ".6f", shown=instead),
+        *_error_of_peak(result),
         Entry("time_of_peak", "at time", unless_lost(result.time_of_max), ".4f", "s", "-" if lost else None),
         Entry("peak_velocity", "peak angular velocity", unless_lost(result.max_velocity), ".6f", "rad/s", instead),
         Entry("margin", "margin (0: boundary)", float(result.margin), "+.4f"),
         Entry("overturned", "verdict", lost, shown="OVERTURNS" if lost else "stands"),
+        *_what_is_open(result),
     ]
 
 
-def _impacts(of_motion: int, of_history: int, duration: float) -> list[Entry]:
-    """Return the number of impacts during the motion, and that of the history in the files if it differs."""
-    entries = [Entry("impacts", "impacts during the motion", of_motion)]
-    if of_history != of_motion:
-        entries.append(Entry("impacts_of_history", f"impacts in {duration:g} s of history", of_history))
+def _impacts(result: rk.responses.Outcome, of_history: int, duration: float) -> list[Entry]:
+    """Return numbers of impacts: of large ones, of all, and of all in the history of the files if it differs."""
+    large, every = int(result.large_impact_count), int(result.impact_count)
+    entries = [
+        Entry("impacts", "impacts during the motion, above 1e-6 alpha", large),
+        Entry("impacts_to_rounding", "with hops down to rounding", every),
+    ]
+    if of_history != every:
+        entries.append(Entry("impacts_of_history", f"with these in {duration:g} s of history", of_history))
     return entries
+
+
+def _error_of_peak(result: rk.responses.Outcome) -> list[Entry]:
+    """Return the error of the peak, where chaotic rocking makes it large."""
+    if result.status != rk.Status.chaotic or bool(result.overturned):
+        return []
+    return [Entry("peak_rotation_error", "known to a standard error of", float(result.error), ".6f", "rad")]
+
+
+def _what_is_open(result: rk.responses.Outcome) -> list[Entry]:
+    """Return the share that overturns where the verdict is open, and the time at which errors outgrow the rotation."""
+    entries = []
+    if result.status == rk.Status.undecided:
+        share = float(result.overturned_share)
+        entries = [Entry("overturned_share", "share of possible motions that overturns", share, ".2f")]
+    until = float(result.known_until)
+    return entries + ([Entry("known_until", "one of many motions after", until, ".2f", "s")] if until < np.inf else [])
 
 
 def _write(report: Report, folder: ResultFolder, response: rk.responses.Response) -> None:

@@ -16,9 +16,15 @@ MOST_OFF = 1e-2  # standard error over the saddle's angle beyond which a state i
 
 
 def checked_step(stepper: AbstractStepper, before: State, after: State) -> State:
-    """Count the step. Stop where the state is not finite, and set the status where its error is too large."""
+    """Count the step. Stop where the state is not finite.
+
+    Where the error of the state is too large, the status is `undecided`, and the state goes on as one of the motions
+    that this error allows: its error starts again from zero.
+    """
     good = jnp.isfinite(after.opening) & jnp.isfinite(after.velocity) & jnp.isfinite(after.local)
-    lost = (after.side != 0) & ~(after.spread.square <= (MOST_OFF * stepper.scene.moments.saddle) ** 2)
+    # Beyond its saddle a block moves away as fast as its error grows.
+    allowed = MOST_OFF * jnp.maximum(jnp.abs(stepper.scene.moments.saddle), after.opening)
+    lost = (after.side != 0) & ~(after.spread.square <= allowed**2)
     if not stepper.history:
         # In the free stage only the next peak or passage counts, which `record_extrema` judges.
         lost = lost & (before.piece < stepper.scene.pieces)
@@ -26,6 +32,7 @@ def checked_step(stepper: AbstractStepper, before: State, after: State) -> State
     status = Status.where(undecided, Status.undecided, after.status)
     return replace(
         after,
+        spread=StateCovariance.where(lost, StateCovariance.none(after.opening), after.spread),
         steps=before.steps + 1,
         status=Status.where(good, status, Status.not_finite),
         done=after.done | ~good,

@@ -22,11 +22,20 @@ from jaxtyping import Array, Int
 
 from jaxrock._core.types import Flag, Scalar
 from jaxrock.compiler.hints import materialize_flag, select, stop_gradient
-from jaxrock.engines.state import State
+from jaxrock.engines.state import LARGE, State
 from jaxrock.engines.stepper import AbstractStepper
 from jaxrock.engines.uncertainty import StateCovariance
 from jaxrock.models.equation import Angle
 from jaxrock.numerics.elementary import logarithm
+
+
+class _Rest(NamedTuple):
+    """The impacts to come, where they bring the block to rest."""
+
+    rests: Flag
+    more: Int[Array, ""]  # down to hops of rounding height
+    large: Int[Array, ""]  # of these, faster than a fall from `LARGE` alpha
+    wait: Scalar  # time that they take [s]
 
 
 class _Rebound(NamedTuple):
@@ -51,13 +60,15 @@ def impact(
     depth = jax.lax.cond(
         slowed, lambda: speed**2 / (2 * select(slowed, -rebound.there, 1.0)), lambda: jnp.zeros_like(speed)
     )
-    rests, more, wait = _rests_if_soon(stepper, state, hit, rebound, steepest, reach)
+    least = jnp.sqrt(2 * LARGE * stepper.scene.alpha * stepper.scene.moments.restoring_at_rest)
+    rests, more, large, wait = _rests_if_soon(stepper, state, hit, rebound, steepest, reach, least)
     fastest = state.fastest
     if stepper.scene.far is not None:  # with unequal corners the rebound may be faster than the approach
         fastest = select(hit & (rebound.speed > fastest), rebound.speed, fastest)
     return replace(
         state,
         impacts=state.impacts + (hit & (speed < 0)) + more,
+        large_impacts=state.large_impacts + (hit & (speed < -least)) + large,
         impact_time=select(hit, stepper.time(state), state.impact_time),
         impact_velocity=select(hit, state.side * speed, state.impact_velocity),
         side=select(rests, 0.0, select(hit, -state.side, state.side)),
@@ -88,24 +99,25 @@ def _rebound(stepper: AbstractStepper, state: State, speed: Scalar, ground: tupl
 
 
 def _rests_if_soon(
-    stepper: AbstractStepper, state: State, hit: Flag, after: _Rebound, steepest: tuple, reach: Scalar
-) -> tuple[Flag, Int[Array, ""], Scalar]:
+    stepper: AbstractStepper, state: State, hit: Flag, after: _Rebound, steepest: tuple, reach: Scalar, least: Scalar
+) -> _Rest:
     """Call `_rests` only where the next hop is short enough for it."""
-    given = stepper, state, hit, after, steepest, reach
-    stepper, state, hit, after, steepest, reach = stop_gradient(given)
+    given = stepper, state, hit, after, steepest, reach, least
+    stepper, state, hit, after, steepest, reach, least = stop_gradient(given)
     # Zero speed counts as soon, unless the ground throws the block on at once; then it moves on as from any speed.
     soon = hit & (8 * after.speed <= reach * stepper.scene.p * after.here)
 
     def never():
-        return jnp.zeros_like(hit), jnp.zeros_like(state.impacts), jnp.zeros_like(reach)
+        none = jnp.zeros_like(state.impacts)
+        return _Rest(jnp.zeros_like(hit), none, none, jnp.zeros_like(reach))
 
-    return jax.lax.cond(soon, lambda: _rests(stepper, state, soon, after, steepest, reach), never)
+    return jax.lax.cond(soon, lambda: _rests(stepper, state, soon, after, steepest, reach, least), never)
 
 
 def _rests(
-    stepper: AbstractStepper, state: State, hit: Flag, after: _Rebound, steepest: tuple, reach: Scalar
-) -> tuple[Flag, Int[Array, ""], Scalar]:
-    """Return whether the impacts to come bring the block to rest, their number, and the time they take [s]."""
+    stepper: AbstractStepper, state: State, hit: Flag, after: _Rebound, steepest: tuple, reach: Scalar, least: Scalar
+) -> _Rest:
+    """Return whether the impacts to come bring the block to rest, their number, and the time they take."""
     scene, rebound = stepper.scene, after.speed
     e, back = scene.reset.most(rebound), scene.far_reset.most(rebound)
     weaker = jnp.minimum(after.here, after.there)
@@ -128,6 +140,10 @@ def _rests(
             dies = dies & ((moments.restoring(top) / moments.restoring_at_rest) ** 2 >= state.closeness)
     rests = materialize_flag(hit & (dies | (rebound == 0)), state.local)
     slower = e if scene.far is None else jnp.sqrt(e * back)  # mean ratio of speeds from hop to hop
-    more = logarithm(low / jnp.maximum(rebound, low)) / logarithm(jnp.clip(slower, 1e-3, 1 - 1e-9))
-    more = select(rests, jnp.ceil(more).astype(state.impacts.dtype), 0)
-    return rests, more, select(rests & (rebound > 0), remaining / scene.p, 0.0)
+    per_impact = logarithm(jnp.clip(slower, 1e-3, 1 - 1e-9))
+
+    def above(limit):
+        count = logarithm(limit / jnp.maximum(rebound, limit)) / per_impact
+        return select(rests, jnp.ceil(count).astype(state.impacts.dtype), 0)
+
+    return _Rest(rests, above(low), above(least), select(rests & (rebound > 0), remaining / scene.p, 0.0))

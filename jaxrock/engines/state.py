@@ -32,7 +32,8 @@ class State(eqx.Module):
     peak_time: Scalar
     error: Scalar  # standard error of the peak
     fastest: Scalar
-    impacts: Int[Array, ""]
+    impacts: Int[Array, ""]  # down to hops of rounding height
+    large_impacts: Int[Array, ""]  # faster than a fall from `LARGE` alpha
     impact_time: Scalar  # of the last impact [s]
     impact_velocity: Scalar  # of the rotation, just before it
     closeness: Scalar  # smallest squared distance from standing still in balance (`margin`)
@@ -84,6 +85,7 @@ class Kept(eqx.Module):
         return self.start.done
 
 
+LARGE = 1e-6  # rotation over alpha from which a block falls to a large impact
 ROUNDING = 4096  # units of rounding within which peaks count as equally high
 # Fields that depend on the parameters of a block once it has rocked.
 _MOVES = (
@@ -137,6 +139,7 @@ def initial_state(scene: Scene, rotation: Scalar, velocity: Scalar) -> State:
         error=zero,
         fastest=select(side == 0, zero, jnp.abs(outward)),
         impacts=count,
+        large_impacts=count,
         impact_time=zero,
         impact_velocity=zero,
         closeness=select(side == 0, unlifted, select(outward == 0, jnp.minimum(stillness, 1.0), 1.0)),

@@ -19,6 +19,7 @@ from jaxrock.compiler.hints import select
 from jaxrock.engines.scene import Scene
 from jaxrock.engines.state import Node, State
 
+FEW_PIECES = 32  # up to which a motion is over before chaos grows
 Stepper = TypeVar("Stepper", bound="AbstractStepper")
 
 
@@ -29,6 +30,11 @@ class AbstractEngine(eqx.Module):
     def reverse(self) -> bool:
         """Return whether reverse mode differentiates this engine's own loops."""
         return False
+
+    @property
+    def forward(self) -> "AbstractEngine":
+        """Return the engine for runs without derivatives."""
+        return self
 
     @property
     def in_lanes(self) -> bool:
@@ -81,6 +87,16 @@ class AbstractStepper(eqx.Module):
         """Advance a state at time 0 to the end of the motion, or until the block is lost."""
         budget = self.engine.budget(self.scene, history=False)
         return self.engine.loop(lambda s: ~s.done & (s.steps < budget), lambda s: self.advance(s), state, budget)
+
+    @property
+    def has_copies(self) -> bool:
+        """Return whether copies are followed where errors outgrow the rotation: under motions of many pieces."""
+        return self.scene.most_pieces > FEW_PIECES
+
+    @property
+    def follows_free_stage(self) -> bool:
+        """Return whether steps follow the free stage, too, unless for a history."""
+        return False
 
     @abc.abstractmethod
     def finish(self, state: State) -> State:

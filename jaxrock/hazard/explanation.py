@@ -10,7 +10,7 @@ from jaxrock._core.arrays import shown
 from jaxrock.hazard.fragility import FitStatus
 from jaxrock.hazard.probit import fit_probit
 from jaxrock.hazard.suites import SuiteOutcomes, measures_by_name
-from jaxrock.studies.suite_scenes import STOOD, TOPPLED
+from jaxrock.studies.suite_scenes import BOUNDS, topples
 
 _STATUSES = ("successful", "separable", "not_growing", "not_converged")
 
@@ -20,7 +20,7 @@ def compare_measures(
     found: SuiteOutcomes,
     measures: Mapping[str, str | Callable] | Sequence[str],
     *,
-    bound: Annotated[str, word_of("lower", "upper")] = "lower",
+    bound: Annotated[str, word_of(*BOUNDS)] = "lower",
     errors: Annotated[str, word_of("clusters", "jackknife")] = "clusters",
 ) -> dict[str, np.ndarray]:
     """Compare how well measures of intensity, each alone, explain the outcomes of a suite.
@@ -29,7 +29,7 @@ def compare_measures(
 
     - `found`: from `suite_outcomes`.
     - `measures`: as in `SuiteOutcomes.table`.
-    - `bound`: whether undecided scenes count as standing ("lower") or toppled ("upper").
+    - `bound`: whether undecided scenes count as standing ("lower"), as toppled ("upper"), or by their share ("share").
     - `errors`: as in `fit_probit`; scenes of one record form a cluster.
 
     **Returns:** columns for `pandas.DataFrame`, by falling auc: measure; auc (probability that a toppled scene had a
@@ -43,7 +43,7 @@ def compare_measures(
     if not measures:
         raise ValueError(f"Argument `measures` must hold a measure, but is {shown(measures)}.")
     table = found.table(measures)
-    toppled = table["verdict"] == TOPPLED if bound == "lower" else table["verdict"] != STOOD
+    toppled = topples(found.verdict, bound, found.share).ravel()
     clusters = np.indices(found.verdict.shape)[0].ravel() // found.suite.turns
     rows = [_row(name, table[name], toppled, clusters, errors) for name in measures_by_name(measures)]
     rows.sort(key=lambda row: -np.nan_to_num(row["auc"]))
@@ -69,10 +69,11 @@ def _row(name: str, values: np.ndarray, toppled: np.ndarray, clusters: np.ndarra
 
 
 def _auc(values: np.ndarray, toppled: np.ndarray) -> float:
-    """Return the probability that a toppled scene has the larger value (ties count half): Mann-Whitney statistic."""
-    from scipy.stats import mannwhitneyu
+    """Return the probability that a toppled scene has the larger value (ties count half): Mann-Whitney statistic.
 
-    if toppled.all() or not toppled.any():
-        return float("nan")
-    first, second = values[toppled], values[~toppled]
-    return float(mannwhitneyu(first, second).statistic / (first.size * second.size))
+    Open scenes count with their share on both sides.
+    """
+    place = np.unique(values, return_inverse=True)[1]
+    fell, stood = np.bincount(place, toppled), np.bincount(place, 1 - toppled)
+    pairs = fell.sum() * stood.sum()
+    return float(fell @ (np.cumsum(stood) - stood / 2) / pairs) if pairs > 0 else float("nan")

@@ -38,6 +38,7 @@ from jaxrock.motions.measures import measure_of, power_of, strengths, unit_of
 from jaxrock.motions.motion import AbstractMotion
 from jaxrock.motions.suite import Suite, repeated
 from jaxrock.studies.suite_scenes import (
+    BOUNDS,
     FACINGS,
     STOOD,
     TOPPLED,
@@ -48,18 +49,19 @@ from jaxrock.studies.suite_scenes import (
     comes_back,
     scenes_of_suite,
     stacked,
+    topples,
 )
 
 
-def counts(verdict: np.ndarray, bound: str | None) -> np.ndarray:
-    """Count toppled scenes along the last axis, with undecided ones as standing ("lower") or toppled ("upper")."""
+def counts(verdict: np.ndarray, bound: str | None, share: np.ndarray | None = None) -> np.ndarray:
+    """Count toppled scenes along the last axis; `bound`, `share`: as in `SimulatedFragility`."""
     undecided = int(np.sum(verdict == UNDECIDED))
     if bound is None and undecided:
         raise ValueError(
-            f"Argument `bound` must be 'lower' or 'upper', because {undecided} of {verdict.size} scenes are undecided."
+            f"Argument `bound` must be 'lower', 'upper' or 'share', because {undecided} of {verdict.size} scenes are "
+            "undecided."
         )
-    upper = bound is not None and one_of("bound", bound, ("lower", "upper")) == "upper"
-    return np.sum(verdict != STOOD if upper else verdict == TOPPLED, axis=-1).astype(float)
+    return topples(verdict, "lower" if bound is None else one_of("bound", bound, BOUNDS), share).sum(axis=-1)
 
 
 class SimulatedFragility(AbstractTable):
@@ -71,6 +73,8 @@ class SimulatedFragility(AbstractTable):
     - `verdict`: (motions, levels, draws) 1 toppled, 0 stood, -1 undecided (the verdict was too close to call, or could
       not be computed).
     - `turns`: number of consecutive motions that are one record at several azimuths.
+    - `share`: in the shape of `verdict`, the share that topples of the motions that errors of the computation allow: 0
+      or 1 with a verdict, 0.5 where nothing is known (None: of all undecided scenes).
     """
 
     levels: Float[Array, " levels"]
@@ -82,6 +86,7 @@ class SimulatedFragility(AbstractTable):
     strength: Float[np.ndarray, " motions"] | None = None
     power: float = eqx.field(static=True, default=1.0)
     turns: int = eqx.field(static=True, default=1)
+    share: Float[np.ndarray, "motions levels draws"] | None = None
 
     @property
     def unit(self) -> str:
@@ -107,11 +112,12 @@ class SimulatedFragility(AbstractTable):
 
         **Arguments:**
 
-        - `bound`: "lower" counts undecided scenes as standing, "upper" as toppled. None is allowed if there are none.
+        - `bound`: "lower" counts undecided scenes as standing, "upper" as toppled, "share" by their `share`. None is
+          allowed if there are none.
 
         **Raises:** ValueError if a bound is needed, or is another word.
         """
-        return counts(self.verdict, bound)
+        return counts(self.verdict, bound, self.share)
 
     @property
     def lower(self) -> Float[np.ndarray, " levels"]:
@@ -290,8 +296,9 @@ def simulated_fragility(
     strongest = factors * np.asarray(suite.peak_acceleration)[:, None]
     checked("levels", strongest.max(axis=0), "keep all motions at 1e9 g or below", lambda x: x <= 1e9)
     found = scenes_of_suite(stacked(block), suite, both_ways(factors, facing), model, engine, progress)
-    peaks, verdict = (suite.peak_acceleration, suite.peak_velocity), as_draws(found.verdict, facing)
-    return SimulatedFragility(levels, verdict, *peaks, suite.names, kind.name, strength, power, suite.turns)
+    verdict, share = (as_draws(each, facing) for each in (found.verdict, found.share))
+    peaks = suite.peak_acceleration, suite.peak_velocity
+    return SimulatedFragility(levels, verdict, *peaks, suite.names, kind.name, strength, power, suite.turns, share)
 
 
 def _factors(levels, strength, power: float) -> np.ndarray:

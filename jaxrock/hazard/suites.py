@@ -4,7 +4,6 @@ Overturning is not monotone in the scale: a block may topple at one and stand at
 monotone, and undecided scenes bound every share from both sides.
 """
 
-import warnings
 from collections.abc import Callable, Mapping, Sequence
 from typing import Annotated
 
@@ -18,7 +17,7 @@ from jaxrock._arguments.parameters import leaves_of
 from jaxrock._arguments.ranges import checked, positive
 from jaxrock._arguments.tables import AbstractTable, Column
 from jaxrock._core.arrays import Values, shown
-from jaxrock._core.precision import frames_of_the_package
+from jaxrock._core.renamed import renamed
 from jaxrock._core.settings import called_by_users
 from jaxrock.blocks.asymmetric import AsymmetricBlock
 from jaxrock.blocks.rigid import Block
@@ -27,7 +26,7 @@ from jaxrock.models.equation import AbstractEquation
 from jaxrock.models.rigid import Housner
 from jaxrock.motions.measures import Measure, measure_of, scaled_strengths
 from jaxrock.motions.motion import AbstractMotion
-from jaxrock.motions.suite import Suite, repeated
+from jaxrock.motions.suite import Suite, warn_of_repeated
 from jaxrock.studies.suite_scenes import (
     FACINGS,
     UNDECIDED,
@@ -46,9 +45,10 @@ class SuiteOutcomes(AbstractTable):
     - `suite`, `blocks` (with parameters of shape (blocks,)), `scale`: (scales,); `facing`: (facings,) 1 as recorded, -1
       turned round.
     - `verdict`: (motions, scales, facings, blocks) 1 toppled, 0 stood, -1 undecided.
-    - `rotation`: in the shape of `verdict`, peak rotation over slenderness (of an asymmetric block over the smaller
-      one); infinite if it toppled, NaN where undecided.
+    - `rotation_ratio`: in the shape of `verdict`, peak rotation over slenderness (of an asymmetric block over the
+      smaller one) [-]; infinite if it toppled, NaN where undecided.
     - `margin`: in the shape of `verdict`, as in `Outcome`; NaN where undecided.
+    - `share`: in the shape of `verdict`, as in `SimulatedFragility`.
     """
 
     suite: Suite
@@ -56,14 +56,17 @@ class SuiteOutcomes(AbstractTable):
     scale: Float[np.ndarray, " scales"]
     facing: tuple[int, ...] = eqx.field(static=True)
     verdict: Int8[np.ndarray, "motions scales facings blocks"]
-    rotation: Float[np.ndarray, "motions scales facings blocks"]
+    rotation_ratio: Float[np.ndarray, "motions scales facings blocks"]
     margin: Float[np.ndarray, "motions scales facings blocks"]
+    share: Float[np.ndarray, "motions scales facings blocks"] | None = None
+
+    rotation = renamed("rotation", "rotation_ratio")
 
     @property
     def _columns(self):
         axes = {"motion": self.suite.names, "scale": self.scale, "facing": self.facing,
                 "block": np.arange(self.verdict.shape[3])}  # fmt: skip
-        results = {"verdict": self.verdict, "rotation_over_alpha": self.rotation, "margin": self.margin}
+        results = {"verdict": self.verdict, "rotation_ratio": self.rotation_ratio, "margin": self.margin}
         told = {name: Column((name,), np.asarray(values)) for name, values in axes.items()}
         return told | {name: Column((*axes,), values) for name, values in results.items()}
 
@@ -87,7 +90,7 @@ class SuiteOutcomes(AbstractTable):
         states = np.asarray(positive("state", state), float)
         if states.ndim != 1 or states.size == 0:
             raise ValueError(f"Argument `state` must be a list of states, but has shape {states.shape}.")
-        found = self.rotation[..., None] >= states  # False where the rotation is NaN
+        found = self.rotation_ratio[..., None] >= states  # False where the rotation is NaN
         bounds = found, found | (self.verdict == UNDECIDED)[..., None]
         return tuple(each.mean(axis=(2, 3)) for each in bounds)
 
@@ -116,7 +119,7 @@ class SuiteOutcomes(AbstractTable):
           scaled motion. None: only the peaks.
 
         **Returns:** motion, (of components: source and azimuth [rad],) scale, facing, block, the block's parameters
-        (except those that all blocks share), PGA [g], PGV [m/s], the measures, rotation_over_alpha, margin, verdict (1
+        (except those that all blocks share), PGA [g], PGV [m/s], the measures, rotation_ratio, margin, verdict (1
         toppled, 0 stood, -1 undecided).
 
         **Raises:** ValueError for measures that are neither functions nor known names, and for repeated names.
@@ -131,7 +134,7 @@ class SuiteOutcomes(AbstractTable):
         columns |= {leaf.name: np.asarray(leaf.value)[block] for leaf in leaves_of(self.blocks) if not leaf.is_shared}
         peaks = {"PGA": self.suite.peak_acceleration, "PGV": self.suite.peak_velocity}
         columns |= {name: np.asarray(peak)[motion] * strength for name, peak in peaks.items()}
-        results = {"rotation_over_alpha": self.rotation, "margin": self.margin, "verdict": self.verdict}
+        results = {"rotation_ratio": self.rotation_ratio, "margin": self.margin, "verdict": self.verdict}
         for name, kind in kinds.items():
             if name not in peaks and name in (columns | results):
                 raise ValueError(f"Argument `measures` must not have names of other columns, but has {name!r}.")
@@ -186,12 +189,7 @@ def suite_outcomes(
     """
     scales = rising_scales(scale)
     suite = motions if isinstance(motions, Suite) else Suite(motions)
-    twice = repeated(suite)
-    if twice:
-        warnings.warn(
-            f"Motions {twice[0]!r} and {twice[1]!r} are the same: what they do counts twice.",
-            stacklevel=frames_of_the_package() + 1,
-        )
+    warn_of_repeated(suite)
     strongest = float(np.max(suite.peak_acceleration))
     checked("scale", scales, "keep all motions at 1e9 g or below", lambda x: x * strongest <= 1e9)
     blocks, ways = stacked(block), FACINGS[facing]

@@ -44,8 +44,16 @@ from jaxrock.motions.mirrored import scaled_and_mirrored
 from jaxrock.motions.motion import AbstractMotion
 from jaxrock.responses.current_model import current_model
 from jaxrock.responses.outcome import outcome
-from jaxrock.status import Status
-from jaxrock.studies.suite_scenes import FACINGS, STOOD, TOPPLED, UNDECIDED, as_draws, both_ways, stacked
+from jaxrock.studies.suite_scenes import (
+    FACINGS,
+    STOOD,
+    TOPPLED,
+    UNDECIDED,
+    as_draws,
+    both_ways,
+    stacked,
+    verdict_and_share,
+)
 from jaxrock.sweeps.sweep import surface
 
 
@@ -232,6 +240,7 @@ class SimulatedSurface(eqx.Module):
     - `acceleration`: (rows,) [g]; `ratio`: (columns,) PGV/PGA [s].
     - `verdict`: (pulses, rows, columns, draws) 1 toppled, 0 stood, -1 undecided.
     - `ways`: 2 if the second half of the draws are the blocks of the first half, turned round.
+    - `share`: in the shape of `verdict`, as in `SimulatedFragility`.
     """
 
     __repr__ = described
@@ -240,6 +249,7 @@ class SimulatedSurface(eqx.Module):
     ratio: Float[Array, " columns"]
     verdict: Int8[np.ndarray, "pulses rows columns draws"]
     ways: int = eqx.field(static=True, default=1)
+    share: Float[np.ndarray, "pulses rows columns draws"] | None = None
 
     @property
     def lower(self) -> Float[np.ndarray, "rows columns"]:
@@ -286,7 +296,8 @@ class SimulatedSurface(eqx.Module):
         **Returns:** a `SurfaceFit`. Each draw, with both of its facings, is a cluster. The covariance measures the
         sampling error of the draws, for the given pulses; for a single block it is NaN.
         """
-        toppled = counts(np.moveaxis(self.verdict, 0, -1), bound)  # (rows, columns, draws), of all pulses
+        share = None if self.share is None else np.moveaxis(self.share, 0, -1)
+        toppled = counts(np.moveaxis(self.verdict, 0, -1), bound, share)  # (rows, columns, draws), of all pulses
         toppled = toppled.reshape(*toppled.shape[:2], self.ways, -1).sum(axis=2)
         cells = np.meshgrid(
             np.asarray(self.acceleration), np.asarray(self.ratio), np.arange(toppled.shape[-1]), indexing="ij"
@@ -335,9 +346,10 @@ def simulated_surface(
         period = ratio * GRAVITY * peak / speed
         group = jax.vmap(lambda t, pulse=pulse: pulse(jnp.ones_like(t), t))(period)
         factors = both_ways(np.broadcast_to(np.asarray(acceleration) / peak, (ratio.size, acceleration.size)), facing)
-        verdict = _verdicts(blocks, group, factors, model, engine, progress)
-        parts.append(as_draws(verdict, facing).swapaxes(0, 1))
-    return SimulatedSurface(acceleration, ratio, np.stack(parts), len(FACINGS[facing]))
+        found = _verdicts(blocks, group, factors, model, engine, progress)
+        parts.append([as_draws(each, facing).swapaxes(0, 1) for each in found])
+    verdict, share = map(np.stack, zip(*parts))
+    return SimulatedSurface(acceleration, ratio, verdict, len(FACINGS[facing]), share)
 
 
 def _unit(pulse: Callable) -> AbstractMotion:
@@ -355,8 +367,8 @@ def _unit(pulse: Callable) -> AbstractMotion:
 
 def _verdicts(
     blocks: Block | AsymmetricBlock, group: AbstractMotion, factors: np.ndarray, model, engine, progress
-) -> np.ndarray:
-    """(motions, levels, draws) of a stack of motions, scaled by factors (motions, levels)."""
+) -> list[np.ndarray]:
+    """Verdicts and shares (motions, levels, draws) of a stack of motions, scaled by factors (motions, levels)."""
     draws = jax.tree.leaves(blocks)[0].shape[0]
     motions, levels = factors.shape
     index, draw = np.arange(motions), np.arange(draws)
@@ -367,13 +379,12 @@ def _verdicts(
         np.repeat(factors[:, None, :], draws, axis=1).ravel(),
     )
     scene = blocks, group, current_model(model, blocks, group, factors), engine
-    table = surface(_verdict, points, scene, "fragility", progress, outer=False)
-    return np.asarray(table).reshape(motions, draws, levels).swapaxes(1, 2)
+    tables = surface(_verdict, points, scene, "fragility", progress, outer=False)
+    return [np.asarray(table).reshape(motions, draws, levels).swapaxes(1, 2) for table in tables]
 
 
 def _verdict(index, draw, factor, scene):
     blocks, group, model, engine = scene
     motion = jax.tree.map(lambda x: x[index], group)  # `jax.vmap` gave every leaf, also shared ones, a leading axis
     result = outcome(one_of_many(blocks, draw), scaled_and_mirrored(motion, factor), model, engine=engine)
-    verdict = jnp.where(result.overturned, TOPPLED, STOOD)
-    return jnp.where(result.status == Status.successful, verdict, UNDECIDED).astype(jnp.int8)
+    return verdict_and_share(result)

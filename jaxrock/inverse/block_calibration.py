@@ -59,8 +59,8 @@ class BlockCalibration(AbstractTable):
       of the observed information. `standard_errors`, by name, are infinite where one would be larger than the range,
       and NaN where there is no maximum.
     - `log_likelihood`: at the maximum, with the priors except for their constants.
-    - `probability`: (tests,) probability of toppling in each test. `bounds`: (2, tests) this probability if all
-      undecided scenes stood, and if all toppled.
+    - `probability`: (tests,) probability of toppling in each test, with undecided scenes by their share. `bounds`:
+      (2, tests) this probability if all undecided scenes stood, and if all toppled.
     - `held_out`: (tests,) probability of toppling from fits to the tests of other motions; NaN where `folds` was 0.
     - `status`: a `CalibrationStatus`.
     """

@@ -132,8 +132,8 @@ class Table(eqx.Module):
     """Outcomes of the scenes of each test, over the cells.
 
     - `seen`: (tests,) 1, 0 or -1.
-    - `toppled`: (tests, cells, ...) share that topples, counting half of the undecided scenes; `lower` and `upper`
-      count none, and all, of these.
+    - `toppled`: (tests, cells, ...) share that topples, counting undecided scenes by the share of their possible
+      motions that topples; `lower` and `upper` count none, and all, of these.
     - `density`: (tests, cells, ...) density of the logarithm of the observed rotation, in scenes that stood.
     """
 
@@ -164,7 +164,7 @@ class Table(eqx.Module):
                 density = np.exp(-(off**2) / 2) / (deviation * np.sqrt(2 * np.pi))
             still = found.rotation < LEAST_SEEN
             density = mean(np.where((told == 0)[:, None, None], still, np.where(still, 0.0, np.nan_to_num(density))))
-        return cls(jnp.asarray(seen), (lower + upper) / 2, lower, upper, density, has)
+        return cls(jnp.asarray(seen), mean(found.share), lower, upper, density, has)
 
 
 def weighed(shares: Float[Array, "tests *cells"], weights: list) -> Float[Array, " tests"]:

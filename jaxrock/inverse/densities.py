@@ -15,8 +15,9 @@ from jaxrock._core.settings import called_by_users
 from jaxrock._core.types import Real
 from jaxrock.compiler.hints import jit_low_effort
 from jaxrock.engines.stepper import AbstractEngine
-from jaxrock.inverse.likelihood import Likelihood, quadrature_accuracy
+from jaxrock.inverse.likelihood import Likelihood
 from jaxrock.inverse.observations import Observations
+from jaxrock.inverse.scatter import quadrature_accuracy
 from jaxrock.inverse.unknowns import Problem, Unknown
 from jaxrock.models.equation import AbstractEquation
 from jaxrock.models.rigid import Housner

@@ -24,7 +24,7 @@ from jaxrock.inverse.batches import in_batches
 from jaxrock.models.equation import AbstractEquation
 from jaxrock.motions.record import Record
 from jaxrock.responses.outcome import outcome
-from jaxrock.status import Status
+from jaxrock.status import is_decided
 
 _LANES = 64  # records in one call of the compiled program
 _SHORTEST, _LONGEST = 1e-4, 1e2  # range of lengths tried first along a direction, over the record's root mean square
@@ -47,10 +47,10 @@ class Site(eqx.Module):
     engine: AbstractEngine | None
 
     def margin(self, block: Block | AsymmetricBlock, change: Float[Array, " n"]):
-        """Return the margin of a block under the changed record, and whether it is known."""
+        """Return the margin of a block under the changed record, and whether its sign is known."""
         record = Record(self.samples + change, self.dt, throw=False)
         result = outcome(block, record, self.model, engine=self.engine, throw=False)
-        return result.margin, result.status == Status.successful
+        return result.margin, is_decided(result.status)
 
     def margins(self, changes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the margins of all blocks under changes, (changes, n), and whether each is known.

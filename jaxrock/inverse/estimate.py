@@ -22,10 +22,11 @@ from jaxrock._core.arrays import to_device
 from jaxrock._core.progress import Progress
 from jaxrock._core.types import Real
 from jaxrock.engines.stepper import AbstractEngine
-from jaxrock.inverse.likelihood import Likelihood, quadrature_accuracy
+from jaxrock.inverse.likelihood import Likelihood
 from jaxrock.inverse.observations import SEEN_ROTATION, SEEN_TOPPLED, Observations
 from jaxrock.inverse.profile_likelihood import Profile, Shape, profile, shape_at
 from jaxrock.inverse.scan import Competing, competing, scan, spread, starts as starts_of
+from jaxrock.inverse.scatter import quadrature_accuracy
 from jaxrock.inverse.search import Trace, optimizer_or_none, summits_of
 from jaxrock.inverse.unknowns import Evaluator, Problem, Unknown
 from jaxrock.models.equation import AbstractEquation

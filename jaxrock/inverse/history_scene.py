@@ -23,7 +23,7 @@ from jaxrock.motions.pulses.exponential import RectangularPulse
 from jaxrock.responses.arguments import engine_of, start_of
 from jaxrock.responses.current_model import current_model
 from jaxrock.responses.history import simulate
-from jaxrock.status import Status
+from jaxrock.status import Status, is_decided
 from jaxrock.studies.parameters import declarations, named, rebuilt
 
 _OF_MEASUREMENT = ("initial", "velocity", "delay", "offset")
@@ -130,9 +130,12 @@ class FittedScene(eqx.Module):
             response = simulate(
                 block, motion, self.model, initial=initial, duration=duration, engine=self.engine, samples=2
             )
-            rotation, _ = response(jnp.clip(time - values.get("delay", 0.0), 0.0, duration))
-        # A verdict that is too close to call concerns the time after the data.
-        known = (response.status == Status.successful) | (response.status == Status.undecided)
+            at = jnp.clip(time - values.get("delay", 0.0), 0.0, duration)
+            rotation, _ = response(at)
+            # Beyond the point where the motion is lost, a slope is no slope.
+            rotation = jnp.where(at <= response.known_until, rotation, jax.lax.stop_gradient(rotation))
+        # An open verdict concerns the time after the data; chaos leaves the first part of a history as it is.
+        known = is_decided(response.status) | (response.status == Status.undecided)
         for _, failed in collected:
             known &= ~failed
         return rotation + values.get("offset", 0.0), known

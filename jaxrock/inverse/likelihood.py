@@ -38,7 +38,7 @@ from jaxrock.compiler import checks, trace_function
 from jaxrock.compiler.hints import jit_low_effort
 from jaxrock.engines.stepper import AbstractEngine
 from jaxrock.inverse.observations import SEEN_ROTATION, SEEN_TOPPLED, Flags, Observations
-from jaxrock.inverse.scatter import LEAST_ACCURATE, MOST_ACCURATE, Possible, Quadrature, are_known_well, levels_around
+from jaxrock.inverse.scatter import Possible, Quadrature, are_known_well, levels_around, quadrature_accuracy
 from jaxrock.models.equation import AbstractEquation
 from jaxrock.models.rigid import Housner
 from jaxrock.motions.mirrored import scaled_and_mirrored
@@ -46,20 +46,14 @@ from jaxrock.motions.motion import AbstractMotion
 from jaxrock.motions.pulses.pulse import AbstractPulse
 from jaxrock.responses.current_model import current_model
 from jaxrock.responses.outcome import outcome
-from jaxrock.status import Status
+from jaxrock.status import Status, is_decided, still_where
+from jaxrock.studies.search_axis import known_margin
 
-_Found = tuple[Real, Flags, Flags]  # margin and rotation, overturned, known
+# Margin and rotation, overturned, known, and the share that overturns where chaos leaves the verdict open, else NaN.
+_Found = tuple[Real, Flags, Flags, Real]
 _NO_STRENGTH = 1e-30  # [g]
 _DRAWS = 8  # random quadratures from which the error of the quadrature is estimated
 _FLAT = -np.log(np.pi / 2)  # log-density of a rotation in (0, pi/2) if only the survival of the rock is known
-
-
-def quadrature_accuracy(name: str, value: Any) -> float:
-    """Check the error that the quadrature may leave in a probability."""
-    known = float(scalar(name, positive(name, value)))
-    if not MOST_ACCURATE <= known <= LEAST_ACCURATE:
-        raise ValueError(f"Argument `{name}` must be in [{MOST_ACCURATE:g}, {LEAST_ACCURATE:g}], but is {known:g}.")
-    return known
 
 
 class Likelihood(eqx.Module):
@@ -264,18 +258,18 @@ class Likelihood(eqx.Module):
         scene = _Scene(self.motion, self.model, self.engine, names)
         fixed, level = jax.lax.stop_gradient((parameters, lanes(levels.strength)))
         if slopes:
-            rows, (real, lost, known) = scene.rows(fixed, level, ways, blocks)
+            rows, (real, lost, known, share) = scene.rows(fixed, level, ways, blocks)
             real = _sloping(real, rows, parameters, scene, level, ways, blocks)
         else:
-            real, lost, known = jax.vmap(scene.results)(fixed, level, ways, blocks)[1]
+            real, lost, known, share = jax.vmap(scene.results)(fixed, level, ways, blocks)[1]
         verge = lanes(levels.alpha * seen.weaker_alpha / seen.alpha)
         # The orientation of a rock and the possible rocks share one axis: all are equally likely.
         merged = (*shape[:-3], -1, shape[-1])
-        where, margin, rotation, lost, known, verge = (
-            x.reshape(merged) for x in (lanes(where), *real.T, lost, known, verge)
+        where, margin, rotation, lost, known, share, verge = (
+            x.reshape(merged) for x in (lanes(where), *real.T, lost, known, share, verge)
         )
         margin, rotation = (jnp.where(known, x, 0.0) for x in (margin, rotation))
-        return Possible.of(where, margin, rotation, known, lost, verge, self.quadrature.apart), impossible
+        return Possible.of(where, margin, rotation, known, lost, verge, self.quadrature.apart, share), impossible
 
     def _strength(self, names: tuple[str, ...], parameters: Real) -> tuple[Real, Bool[Array, ""]]:
         """Return the logarithm of the strength of a motion, and whether the motion is impossible."""
@@ -338,13 +332,14 @@ class _Scene(eqx.Module):
     names: tuple[str, ...] = eqx.field(static=True)
 
     def results(self, parameters: Real, level: Real, way: Real, block) -> tuple[Real, _Found]:
-        """Return margin and rotation; as auxiliary data these again, the verdict, and whether it is known."""
+        """Return margin and rotation; as auxiliary data these again, and the rest of `_Found`."""
         with checks.collect():  # `_strength` collects the motion's checks, and the rocks have passed theirs
             motion = self.motion(**dict(zip(self.names, parameters)))
             result = outcome(block, _of_strength(motion, level, way), self.model, engine=self.engine)
         rotation = jnp.where(result.overturned, 0.0, result.max_rotation)
-        real = jnp.stack([result.margin, rotation])
-        return real, (real, result.overturned, result.status == Status.successful)
+        real = still_where(result.status == Status.chaotic, jnp.stack([result.margin, rotation]))
+        share = jnp.where(known_margin(result.margin, result.status)[1], result.overturned_share, jnp.nan)
+        return real, (real, result.overturned, is_decided(result.status), jax.lax.stop_gradient(share))
 
     def rows(self, parameters: Real, level: Real, way: Real, block) -> tuple[Real, _Found]:
         """Return the rows of the Jacobian by the parameters, of many lanes, with the values; zero where not finite."""

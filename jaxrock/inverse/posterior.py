@@ -23,9 +23,10 @@ from jaxrock._core.types import Real
 from jaxrock.engines.stepper import AbstractEngine
 from jaxrock.inverse.densities import LogDensity
 from jaxrock.inverse.estimate import Estimate, EstimateStatus, estimate_motion
-from jaxrock.inverse.likelihood import Likelihood, quadrature_accuracy
+from jaxrock.inverse.likelihood import Likelihood
 from jaxrock.inverse.observations import Observations
 from jaxrock.inverse.samplers import rounds_of
+from jaxrock.inverse.scatter import quadrature_accuracy
 from jaxrock.inverse.unknowns import Problem, Unknown, densities
 from jaxrock.models.equation import AbstractEquation
 from jaxrock.models.rigid import Housner

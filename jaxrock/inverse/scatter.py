@@ -22,15 +22,16 @@ direction is added to that of the amplitude: the total is right for any number o
 """
 
 import functools
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.scipy.special import log_ndtr, logsumexp, ndtr
+from jax.scipy.special import log_ndtr, logsumexp, ndtr, ndtri
 from jaxtyping import ArrayLike
 
+from jaxrock._arguments.ranges import positive, scalar
 from jaxrock._core.arrays import is_traced, to_device
 from jaxrock._core.types import Real
 from jaxrock.inverse.observations import Flags, Observations
@@ -47,8 +48,17 @@ _SLOPE_OVER = 1.2  # standard deviations at each end from which y is extrapolate
 _LEAST_SLOPE = 0.05  # of y by a standard deviation, beyond the outermost nodes
 _END_WIDTH = 0.1  # width of the probit of y beyond these nodes, so that the probability is smooth
 _BY_P = 0.5  # change of ln amplitude with the effect of that of ln p: from 0 for long pulses to 1 for short ones
+_LEAST_SHARE = 1 / 64  # half of one of the 32 copies that an engine follows at most
 _GOLDEN = (np.sqrt(5) - 1) / 2
 _DESIGNS = 200  # number of Latin hypercubes drawn; the least correlated is used
+
+
+def quadrature_accuracy(name: str, value: Any) -> float:
+    """Check the error that the quadrature may leave in a probability."""
+    known = float(scalar(name, positive(name, value)))
+    if not MOST_ACCURATE <= known <= LEAST_ACCURATE:
+        raise ValueError(f"Argument `{name}` must be in [{MOST_ACCURATE:g}, {LEAST_ACCURATE:g}], but is {known:g}.")
+    return known
 
 
 class Quadrature(eqx.Module):
@@ -197,17 +207,18 @@ class Possible(NamedTuple):
     weight: Real  # normal probability around each quarter point
     y: Real  # the margin, transformed to be nearly linear in ln amplitude
     width: Real  # width of the probit of y
-    known: Flags  # whether it was computed
+    known: Flags  # whether it was computed, with a verdict
+    stands: Real  # share that stands where chaos leaves the verdict of a node open, as a normal quantile; else 0
     ends: Real  # y at the first and the last node, its slope beyond, and where they are
     rotation: Real  # [rad]
     rotation_width: Real
 
     @classmethod
-    def of(cls, where, margin, rotation, known, lost, verge, apart: float) -> "Possible":
+    def of(cls, where, margin, rotation, known, lost, verge, apart: float, share: Real | None = None) -> "Possible":
         """Interpolate from results at nodes, (nodes, ..., ways, rocks).
 
         Nodes lie at the given distances in standard deviations, `apart` from each other; `verge` is the rotation from
-        which a rock at rest overturns.
+        which a rock at rest overturns; `share`, NaN elsewhere, overturns where chaos leaves the verdict open.
 
         On the way to overturning the rotation grows without bounds with the amplitude. The energy left to overturn,
         about (1 - rotation/verge)^2, does not; it passes zero with y, and is about twice y there.
@@ -216,7 +227,10 @@ class Possible(NamedTuple):
         left = jnp.where(lost, 2 * _straightened(jnp.minimum(margin, 0.0)), left * jnp.abs(left))
         left = jnp.where(known, left, 0.25)
         ends_of_parts = jnp.concatenate([verge[:1], _halves(verge)]), jnp.concatenate([left[:1], _halves(left)])
-        y, known = _bridged(_straightened(jnp.where(known, margin, 0.0)), known)
+        share = jnp.full_like(margin, jnp.nan) if share is None else share
+        is_open = ~jnp.isnan(share)
+        y, known = _bridged(_straightened(jnp.where(known, margin, 0.0)), known, ~is_open)
+        stands = _stands(jnp.where(is_open, 1 - share, jnp.where(y < 0, 0.0, 1.0)), known, is_open)
         width = jnp.sqrt((_SMEAR * jnp.diff(y, axis=0)) ** 2 + _LEAST_WIDTH**2)
         few = min(max(round(_SLOPE_OVER / apart), 1), len(y) - 1)
         # Distances `where` depend on the scatter, through which slopes have derivatives by it; the nodes are fixed.
@@ -228,7 +242,7 @@ class Possible(NamedTuple):
         half = jnp.concatenate([where[:1], _halves(where)])
         weight = jnp.diff(ndtr(half), axis=0)
         return cls(
-            weight, _between(y), _twice(width), _twice(known[1:] & known[:-1]), ends,
+            weight, _between(y), _twice(width), _twice(known[1:] & known[:-1]), stands, ends,
             _rotation(_between(verge), _between(left)), jnp.abs(jnp.diff(_rotation(*ends_of_parts), axis=0)),
         )  # fmt: skip
 
@@ -238,8 +252,8 @@ class Possible(NamedTuple):
         With a log-density of each part, the ends first and last, a third row is standing with that density. All rows
         are computed together: a program of half the length compiles in half the time.
         """
-        # A scene that was not computed counts as one half, without slope.
-        inner = jnp.where(self.known, self.y / self.width, 0.0)
+        # An open scene counts with its share, one that was not computed as one half; both have no slope.
+        inner = jnp.where(self.known, self.y / self.width, self.stands)
         # A sufficiently small motion spares every rock, and a sufficiently large one topples it: extrapolate y to its
         # zero beyond the outermost nodes.
         first, last, before, after, below, above = self.ends
@@ -311,9 +325,19 @@ def _straightened(margin: Real) -> Real:
     return jnp.where(lost, -jnp.log1p(-jnp.where(lost, margin, 0.0)) / 2, margin / 2 + margin**2 / 4)
 
 
-def _bridged(values: Real, known: Flags) -> tuple[Real, Flags]:
-    """Fill a single node that was not computed with the mean of both neighbours, consistent with interpolation."""
-    alone = ~known[1:-1] & known[:-2] & known[2:]
+def _stands(share: Real, known: Flags, is_open: Flags) -> Real:
+    """Return the normal quantile of the share that stands, at the quarter points of intervals with an open end.
+
+    It is zero elsewhere. A share of all, or of none, is taken to be half a copy away from that.
+    """
+    told = known | is_open
+    between = jnp.where(_twice(told[1:] & told[:-1]), _between(share), 0.5)
+    return jax.lax.stop_gradient(ndtri(jnp.clip(between, _LEAST_SHARE, 1 - _LEAST_SHARE)))
+
+
+def _bridged(values: Real, known: Flags, may: Flags) -> tuple[Real, Flags]:
+    """Fill a single node that was not computed with the mean of both neighbours, where it `may` be filled."""
+    alone = ~known[1:-1] & known[:-2] & known[2:] & may[1:-1]
     inner = jnp.where(alone, (values[:-2] + values[2:]) / 2, values[1:-1])
     known = jnp.concatenate([known[:1], known[1:-1] | alone, known[-1:]])
     return jnp.concatenate([values[:1], inner, values[-1:]]), known

@@ -3,6 +3,7 @@
 import contextlib
 import dataclasses
 import operator
+import warnings
 from collections import Counter
 from collections.abc import Hashable, Iterator, Sequence
 from typing import Annotated, Any
@@ -19,6 +20,7 @@ from jaxrock._arguments.ranges import direction
 from jaxrock._arguments.repr import described
 from jaxrock._core.arrays import Values, is_traced, shown, to_device
 from jaxrock._core.named import AbstractNamed
+from jaxrock._core.precision import frames_of_the_package
 from jaxrock._core.settings import called_by_users
 from jaxrock.compiler import checks
 from jaxrock.motions.components import Components
@@ -246,6 +248,16 @@ def repeated(suite: Suite) -> tuple[str, str] | None:
         if before is not name:
             return before, name
     return None
+
+
+def warn_of_repeated(suite: Suite) -> None:
+    """Warn, at the user's line, of two identical motions in a suite."""
+    twice = repeated(suite)
+    if twice:
+        warnings.warn(
+            f"Motions {twice[0]!r} and {twice[1]!r} are the same: what they do counts twice.",
+            stacklevel=frames_of_the_package() + 1,
+        )
 
 
 def _content(value: Any) -> Hashable:

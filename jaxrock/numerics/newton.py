@@ -63,13 +63,14 @@ def root_between(degrees, terms: list[Scalar], start: Scalar, end: Scalar, value
         change = value / slope
         return jnp.clip(x - change, start, end), jnp.abs(change)
 
-    for degree in degrees if order > 10 else (order,):  # low orders belong to the short steps of records
-        x, change = nearer(x, degree)
+    for degree in degrees if order > 10 else ():  # low orders belong to the short steps of records
+        x, _ = nearer(x, degree)
 
     def unsettled(carry):
         x, change, count = carry
         return ~(change <= _settled(x) * x) & (count < _MORE)
 
-    more = x, change, jnp.zeros_like(x, jnp.int32)
+    # At least once in full degree: two truncated polynomials may agree by chance.
+    more = x, jnp.full_like(x, jnp.inf), jnp.zeros_like(x, jnp.int32)
     x, change, _ = jax.lax.while_loop(unsettled, lambda carry: (*nearer(carry[0], order), carry[2] + 1), more)
     return x, change

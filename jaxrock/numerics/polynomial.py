@@ -185,6 +185,32 @@ def last_size(coefficients: list[Scalar]) -> Scalar:
     return jnp.maximum(last, 0.02 * jnp.maximum(jnp.abs(coefficients[-3]), jnp.abs(coefficients[-4])))
 
 
+_CAUTION = 24.0  # ratios of coefficients vary
+
+
+def remainder(coefficients: list[Scalar], x: Scalar) -> Scalar:
+    """Return an estimate of the terms after the last, at `x`, not above the last two.
+
+    It is the last two terms times the larger of two ratios: of these to the two before, and of those to the two before
+    them. Pairs, because every second coefficient may vanish.
+    """
+    pairs = [
+        jnp.maximum(jnp.abs(coefficients[-k]) * x, jnp.abs(coefficients[-k - 1]))
+        for k in (1, 3, 5)
+        if k < len(coefficients)
+    ]
+    last, before = pairs[:2]
+    falls = x**2  # each pair is two powers later
+    if len(pairs) > 2:
+        slower = last * pairs[2] < before * before
+        over, under = select(slower, before, last), select(slower, pairs[2], before)
+    else:
+        over, under = last, before
+    tiny = jnp.finfo(last.dtype).tiny
+    ratio = jnp.minimum(_CAUTION * falls * over / jnp.maximum(under, tiny), 1.0)
+    return ratio * last * x ** (len(coefficients) - 2)
+
+
 def step_length(coefficients: list[Scalar], size: Scalar | float, cap: Scalar) -> Scalar:
     """Return the step at which the last coefficients drop below `size`, at most `cap`."""
     order, last = len(coefficients) - 1, last_size(coefficients)

@@ -13,9 +13,15 @@ from jaxrock.plot.fragilities import fragility as fragility, fragility_surface a
 from jaxrock.plot.regions import feasible_region as feasible_region, search as search
 from jaxrock.plot.responses import history as history, phase as phase
 from jaxrock.plot.rocks import righting as righting, slenderness as slenderness
-from jaxrock.plot.sensitivities import critical as critical, sensitivity_map as sensitivity_map, tornado as tornado
+from jaxrock.plot.sensitivities import (
+    critical as critical,
+    critical_scales as critical_scales,
+    sensitivity_map as sensitivity_map,
+    tornado as tornado,
+)
+from jaxrock.plot.spectra import spectrum as spectrum
 from jaxrock.plot.style import broken_curve as broken_curve, log_ticks as log_ticks
-from jaxrock.plot.surfaces import borders as borders, overturning as overturning, spectrum as spectrum
+from jaxrock.plot.surfaces import borders as borders, overturning as overturning
 
 
 def __dir__() -> list[str]:

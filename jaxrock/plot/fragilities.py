@@ -9,6 +9,7 @@ from jaxrock.hazard.fragility import LogNormalFragility
 from jaxrock.hazard.simulation import SimulatedFragility
 from jaxrock.hazard.surfaces import SimulatedSurface, SurfaceFragility
 from jaxrock.plot.style import BLUE, RED, SAND, draw_cells, figure, limits_of, log_ticks
+from jaxrock.studies.suite_scenes import topples
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -60,7 +61,7 @@ def fragility_surface(
 
     **Arguments:**
 
-    - `simulated`: result of `simulated_surface`. Drawn shares are the means of their bounds.
+    - `simulated`: result of `simulated_surface`. Undecided scenes count by their share.
     - `fit`: a `SurfaceFragility` whose contours are drawn over the shares, dashed.
     - `axis`: matplotlib axis; None makes a figure. `contours`: probabilities.
 
@@ -71,7 +72,7 @@ def fragility_surface(
     if axis is None:
         _, axis = plt.subplots(figsize=(5.5, 4), layout="constrained")
     ratio, acceleration = np.asarray(simulated.ratio), np.asarray(simulated.acceleration)
-    share = (simulated.lower + simulated.upper) / 2
+    share = topples(simulated.verdict, "share", simulated.share).mean(axis=(0, 3))
     picture = draw_cells(axis, ratio, acceleration, np.asarray(share), cmap="YlOrBr", vmin=0, vmax=1)
     axis.figure.colorbar(picture, ax=axis, label="probability to topple")
     if min(share.shape) > 1:  # a line of cells has no contours

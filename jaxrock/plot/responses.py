@@ -14,7 +14,7 @@ from jaxrock.motions.mirrored import has_vertical
 from jaxrock.motions.motion import AbstractMotion
 from jaxrock.plot.style import BLUE, GREY, RED, SAND, figure
 from jaxrock.responses.history import Response
-from jaxrock.status import Status
+from jaxrock.status import Status, is_decided
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -86,7 +86,7 @@ def vertical_of(motion: AbstractMotion, time: np.ndarray) -> np.ndarray | None:
 
 def why_not(status: Status) -> str:
     """Return a short reason for a response without a result, "no result: ..."; otherwise an empty string."""
-    if bool(np.asarray(status == Status.successful)):
+    if bool(np.asarray(is_decided(status))):
         return ""
     reason = re.split("[,:.]", Status[status])[0]
     return f"no result: {reason[0].lower()}{reason[1:]}"

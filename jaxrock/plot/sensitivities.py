@@ -1,13 +1,14 @@
 """Figures of sensitivities and of critical amplitudes."""
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from jaxrock._arguments.ranges import one_of
+from jaxrock._arguments.annotations import pair
+from jaxrock._arguments.ranges import one_of, positive, scalar
 from jaxrock.plot.style import BLUE, DURATION, RED, SAND, draw_cells, figure, in_order
-from jaxrock.studies.critical import Critical
+from jaxrock.studies.critical_ends import Critical, intervals_of
 from jaxrock.studies.sensitivities import Sensitivity, SensitivityMap, SlopeStatus
 
 if TYPE_CHECKING:
@@ -140,3 +141,50 @@ def critical(
     axis.set(xlabel=label, ylabel="intensity: amplitude/threshold")
     axis.legend(fontsize=8, frameon=False)
     return axis
+
+
+@figure(1)
+def critical_scales(
+    ends: Critical,
+    axis: "Axes | None" = None,
+    *,
+    between: Annotated[tuple[float, float] | None, pair] = None,
+) -> "Axes":
+    """Draw the scales at which one block overturns as bands, and at their ends the number of impacts before.
+
+    Intervals too thin to be seen as bands are seen as lines.
+
+    **Arguments:**
+
+    - `ends`: result of `critical_amplitudes`, or `critical_durations`, for one scene.
+    - `axis`: matplotlib axis; None makes a figure.
+    - `between`: least and largest scale that were searched [-], positive and rising; None: a little beyond the ends.
+
+    **Returns:** the axis.
+    """
+    import matplotlib.pyplot as plt
+
+    if ends.value.ndim != 1 or ends.scale is None:
+        raise ValueError("Argument `ends` must be of one scene and have scales, as `critical_amplitudes` returns it.")
+    scale, rising = (np.asarray(x)[: int(ends.count)] for x in (ends.scale, ends.rising))
+    limits = between if between is not None else _around(scale)
+    low, high = (float(scalar("between", positive("between", end))) for end in limits)
+    if low >= high:
+        raise ValueError(f"Argument `between` must be rising, but is {between}.")
+    if axis is None:
+        _, axis = plt.subplots(figsize=(7, 3), layout="constrained")
+    for first, last in intervals_of(ends):
+        edges = low if first is None else scale[first], high if last is None else scale[last]
+        axis.axvspan(*edges, facecolor=RED, edgecolor=RED, linewidth=0.5, alpha=0.25)
+    impacts = np.asarray(ends.impacts)[: scale.size]
+    for name, color, kind in (("overturns above", RED, rising), ("stands above", BLUE, ~rising)):
+        axis.plot(scale[kind], impacts[kind], ".", color=color, label=name)
+    axis.set(xlabel="scale", ylabel="impacts before", xlim=(low, high))
+    axis.set_ylim(bottom=min(0, axis.get_ylim()[0]))
+    axis.legend(fontsize=8, frameon=False)
+    return axis
+
+
+def _around(scale: np.ndarray) -> tuple[float, float]:
+    """Return limits a twentieth beyond the ends; of no ends, around 1."""
+    return (scale.min() / 1.05, scale.max() * 1.05) if scale.size else (0.5, 2.0)

@@ -143,3 +143,10 @@ def shade(axis: "Axes", places: np.ndarray, which: np.ndarray, **patch) -> None:
     for begin, end in ends.reshape(-1, 2):
         axis.axvspan(edges[begin], edges[end], label=label, **patch)
         label = None
+
+
+def without_more(result: Any) -> None:
+    """Raise ValueError for a spectrum or a map with further axes."""
+    if result.parameters:
+        names = ", ".join(f"`{name}`" for name in result.parameters)
+        raise ValueError(f"Argument `result` must have no further axes, but has {names}: draw one of its parts.")

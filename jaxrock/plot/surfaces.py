@@ -1,7 +1,6 @@
-"""Figures of many responses: spectra and overturning maps."""
+"""Figures of overturning maps."""
 
 import logging
-from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,16 +14,14 @@ from jaxrock.plot.style import (
     RATIO,
     RED,
     STRENGTH,
-    broken_curve,
     draw_cells,
     figure,
     in_order,
     limits_of,
-    shade,
+    without_more,
 )
-from jaxrock.status import Status
 from jaxrock.studies.borders import Borders, Region, borders_within, has_two_axes, overturning_borders
-from jaxrock.studies.spectra import OverturningMap, Spectrum
+from jaxrock.studies.spectra import OverturningMap
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -33,80 +30,6 @@ _LOG = logging.getLogger("jaxrock")
 _SCENES = 500_000  # most scenes for exact borders of a figure: enough for all pulses except the longest
 _SAFE = ("#faf7ee", "#c4a35a")  # survivors, from those at rest to those that nearly overturn
 _STATES = ("black", BLUE, RED)  # not computed, overturned without impact, overturned after impacts
-
-
-@figure(2)
-def spectrum(result: Spectrum, axes: "Sequence[Axes] | None" = None, *, by_duration: bool = False) -> "Sequence[Axes]":
-    """Draw a rocking spectrum: peak rotation and peak velocity; sizes that overturn are shaded.
-
-    A response that was not computed (see `status`) is a gap, with a cross on the lower axis.
-
-    **Arguments:**
-
-    - `result`: from `rocking_spectrum` or `self_similar_spectrum`, without further axes.
-    - `axes`: two matplotlib axes; None makes a figure.
-    - `by_duration`: whether to draw a self-similar spectrum over the pulse duration, one curve per uplift strength.
-
-    **Returns:** the two axes.
-
-    **Raises:** ValueError for a spectrum with further axes, or `by_duration` of one of a record.
-    """
-    import matplotlib.pyplot as plt
-
-    _without_more(result)
-    if by_duration and result.intensity is None:
-        raise ValueError("Argument `by_duration` must be False for the spectrum of a motion that is given in seconds.")
-
-    own = axes is None
-    if axes is None:
-        _, axes = plt.subplots(2, 1, sharex=True, figsize=(7, 5.5), layout="constrained")
-    abscissa, order = in_order(result.pulse_duration if by_duration else result.abscissa)
-    labels = result.uplift_strength if by_duration else result.intensity
-    good = np.asarray(result.status == Status.successful)
-    known = np.atleast_2d(np.broadcast_to(good, result.overturned.shape))[:, order]
-    lost = np.atleast_2d(np.asarray(result.overturned))[:, order] & known
-    for axis, values in zip(axes, (result.max_rotation, result.max_velocity)):
-        values = np.where(known, np.atleast_2d(np.asarray(values))[:, order], np.nan)
-        _curves(axis, abscissa, values, labels)
-        said = "overturned" if len(values) == 1 else "all overturned"
-        shade(axis, abscissa, lost.all(axis=0), color=RED, alpha=0.15, linewidth=0, label=said)
-        if axis.dataLim.y1 <= 0:  # all overturned, or all at rest
-            axis.set_ylim(0, 1, auto=True)
-    if known.any() and not lost.any() and all(axis.dataLim.y1 <= 0 for axis in axes):
-        axes[0].text(0.5, 0.5, "no block uplifts", ha="center", color=GREY, transform=axes[0].transAxes)
-    axes[0].set_ylabel(r"peak rotation $\theta_{max}/\alpha$")
-    axes[1].set_ylabel(r"peak velocity $\dot\theta_{max}/(p\alpha)$")
-    self_similar = result.intensity is not None
-    across = DURATION if by_duration else RATIO
-    axes[1].set_xlabel(across if self_similar else r"$2\pi/p$ [s]")
-    if self_similar or axes[0].get_legend_handles_labels()[0]:
-        many = own and len(lost) > 4  # a long legend would hide the curves: place it outside
-        axes[0].legend(
-            title=("uplift strength" if by_duration else "intensity") if self_similar else None,
-            fontsize=8, title_fontsize=8, framealpha=0.85, edgecolor="none",
-            loc="upper left" if many else "upper right", bbox_to_anchor=(1.0, 1.0),
-        )  # fmt: skip
-    return axes
-
-
-def _curves(axis: "Axes", abscissa: np.ndarray, rows: np.ndarray, labels) -> None:
-    """Draw the curves of a spectrum; NaN was not computed, and gets a cross on the lower axis."""
-    import matplotlib.pyplot as plt
-
-    colors = plt.colormaps["viridis"](np.linspace(0, 0.85, len(rows))) if len(rows) > 1 else [BLUE]
-    for i, (curve, color) in enumerate(zip(rows, colors)):
-        label = None if labels is None else f"{float(labels[i]):g}"
-        broken_curve(axis, abscissa, curve, color=color, linewidth=1, label=label)
-    axis.update_datalim([(abscissa[0], 0)])  # start at zero, unless the user makes the axis logarithmic
-    axis.lines[-1].sticky_edges.y.append(0)
-    axis.autoscale_view()
-    said: str | None = "not computed"
-    for row, color in zip(np.isnan(rows), colors):
-        if row.any():
-            level = np.full(row.sum(), 0.02)
-            axis.plot(abscissa[row], level, "x", color=color, markersize=4, label=said,
-                      transform=axis.get_xaxis_transform())  # fmt: skip
-            said = None
 
 
 @figure(1)
@@ -140,7 +63,7 @@ def overturning(
     import matplotlib.pyplot as plt
     from matplotlib.colors import BoundaryNorm, LinearSegmentedColormap, ListedColormap
 
-    _without_more(result)
+    without_more(result)
     if axis is None:
         _, axis = plt.subplots(figsize=(7, 5), layout="constrained")
     x = np.asarray(result.pulse_duration if by_duration else result.frequency_ratio)
@@ -150,7 +73,7 @@ def overturning(
     axis.set_facecolor(_SAFE[0])
     if safe:
         shades = LinearSegmentedColormap.from_list("survivors", _SAFE)
-        peaks = _beyond(np.where(state == 0, np.asarray(result.max_rotation)[np.ix_(rows, columns)], np.nan))
+        peaks = _beyond(np.where(state == 0, np.asarray(result.rotation_ratio)[np.ix_(rows, columns)], np.nan))
         picture = draw_cells(axis, x, y, peaks, cmap=shades, vmin=0, vmax=1)
         axis.figure.colorbar(picture, ax=axis, label=r"peak rotation of survivors $\theta_{max}/\alpha$", extend="max")
     pixels, found = np.ones(x.size, bool), _borders_of(result, exact, progress)
@@ -238,7 +161,7 @@ def borders(
     """
     import matplotlib.pyplot as plt
 
-    _without_more(result)
+    without_more(result)
     if axis is None:
         _, axis = plt.subplots(figsize=(6, 4), layout="constrained")
     label = line.pop("label", None)
@@ -278,9 +201,3 @@ def _beyond(peaks: np.ndarray) -> np.ndarray:
     moved = [around[i : i + n, j : j + m] for i in range(3) for j in range(3)]
     nearest = np.fmax.reduce(moved)
     return np.where(np.isnan(peaks), nearest, peaks)
-
-
-def _without_more(result: Spectrum | OverturningMap) -> None:
-    if result.parameters:
-        names = ", ".join(f"`{name}`" for name in result.parameters)
-        raise ValueError(f"Argument `result` must have no further axes, but has {names}: draw one of its parts.")

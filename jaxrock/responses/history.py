@@ -35,7 +35,7 @@ from jaxrock.numerics.derivatives_of import with_derivatives_of
 from jaxrock.responses.arguments import USUAL, AnyBlock, RigidBlock, engine_of, start_of, steps_of_flexible
 from jaxrock.responses.compile_setup import numbers_of, with_numbers
 from jaxrock.responses.current_model import current_model, standing
-from jaxrock.responses.steps import Summary, history_like, started, steps_followed, steps_on_tape
+from jaxrock.responses.steps import Summary, history_like, started, steps_followed, steps_on_tape, with_copies
 from jaxrock.status import Status, still_if_none
 
 
@@ -45,8 +45,11 @@ class Response(AbstractTable):
     - `time`, `rotation`, `velocity`: (samples,) equally spaced history [s], [rad], [rad/s].
     - `impact_times`, `impact_velocities`: of every impact [s] and just before it [rad/s].
     - `peak_times`, `peak_rotations`: of every turning point [s], [rad].
-    - `impact_count`, `max_rotation` [rad], `time_of_max` [s], `max_velocity` [rad/s]: within the duration.
-    - `overturned`, `margin`, `status`: as in `Outcome`; the verdict looks beyond a duration that covers the motion.
+    - `impact_count`, `large_impact_count`, `max_rotation` [rad], `time_of_max` [s], `max_velocity` [rad/s]: within the
+      duration.
+    - `overturned`, `overturned_share`, `margin`, `error` [rad], `status`: as in `Outcome`; the verdict looks beyond a
+      duration that covers the motion.
+    - `known_until`: time after which the history is one of many that errors of the computation allow [s].
 
     Where the step budget ended the history early (see `status`), later rotations and velocities are NaN. Under jit or
     vmap the arrays of impacts and peaks have fixed length: times are padded with inf, values with 0. Outside they hold
@@ -85,6 +88,11 @@ class Response(AbstractTable):
         return self.summary.impact_count
 
     @property
+    def large_impact_count(self) -> Int[Array, "..."]:
+        """Number of impacts within the duration that are faster than a fall from a rotation of 1e-6 alpha."""
+        return self.summary.large_impact_count
+
+    @property
     def max_rotation(self) -> Real:
         """Largest |rotation| within the duration [rad]; infinite if the block overturned."""
         return self.summary.max_rotation
@@ -103,6 +111,21 @@ class Response(AbstractTable):
     def overturned(self) -> Bool[Array, "..."]:
         """The verdict, which looks beyond a duration that covers the motion."""
         return self.summary.overturned
+
+    @property
+    def overturned_share(self) -> Real:
+        """Share that overturns of the motions that errors of the computation allow [-]."""
+        return self.summary.overturned_share
+
+    @property
+    def error(self) -> Real:
+        """Estimated standard error of the largest rotation [rad]; infinite if the block overturned."""
+        return self.summary.error
+
+    @property
+    def known_until(self) -> Real:
+        """Time after which the history is one of many that errors of the computation allow [s]; else infinite."""
+        return self.summary.known_until
 
     @property
     def margin(self) -> Real:
@@ -236,6 +259,7 @@ def simulate(
     given = standing(block, model, engine, throw), padded(motion), model, start, duration
     block, motion, model, start, duration = given if throw else still_if_none(given)
     summary, path = _simulate(block, motion, model, start, duration, engine)
+    summary = with_copies((block, motion, model, start, path.duration, engine), summary)
     time = path.equally_spaced(samples)
     rotation, velocity = _evaluate(path, time)
     response = Response(time, rotation, velocity, summary, path)

@@ -1,6 +1,9 @@
 """The outcome of a block under a motion: peak, verdict, margin."""
 
-from typing import Annotated, overload
+import functools
+from collections.abc import Callable
+from dataclasses import fields, replace
+from typing import Annotated, Any, overload
 
 import jax
 import jax.numpy as jnp
@@ -13,10 +16,12 @@ from jaxrock._core.precision import say_if_single
 from jaxrock._core.types import Real
 from jaxrock.blocks.flexible import FlexibleBlock
 from jaxrock.compiler import TwoPass, checks, lane_function
-from jaxrock.compiler.hints import select
+from jaxrock.compiler.hints import stop_gradient
+from jaxrock.engines.conclusion import Conclusion, conclude
+from jaxrock.engines.copies import TOLD, conclude_with_copies
 from jaxrock.engines.scene import Scene
-from jaxrock.engines.state import ROUNDING, State, all_moving, initial_state
-from jaxrock.engines.stepper import AbstractEngine, AbstractStepper
+from jaxrock.engines.state import State, all_moving, initial_state
+from jaxrock.engines.stepper import AbstractEngine
 from jaxrock.engines.taylor.accurate import Series
 from jaxrock.engines.taylor.fast_loop import fast_loop, most_steps
 from jaxrock.engines.taylor.policy import POLICY
@@ -40,7 +45,10 @@ class Outcome(AbstractTable):
     - `impact_count`: impacts during the motion, and those after it if the block overturns after them (one, of an
       asymmetric block up to two). The infinitely many impacts of a block that comes to rest are counted down to hops of
       rounding height.
+    - `large_impact_count`: of these, the impacts faster than a fall from a rotation of 1e-6 alpha.
     - `overturned`: the verdict.
+    - `overturned_share`: share that overturns [-] of the motions that errors of the computation allow: 0 or 1 where the
+      verdict holds.
     - `margin`: signed distance to overturning [-]: positive safe, negative overturned, zero on the boundary.
     - `differentiable`: whether `max_rotation` is a smooth function here. It is not where two peaks tie, where an impact
       before the peak is grazed, or if the block overturned. Ties and grazes count within 1e-9, in single precision
@@ -50,6 +58,8 @@ class Outcome(AbstractTable):
       the ground, or the least depth to which it would have come where it hit the ground while being slowed down. It is
       infinite if there was neither. Where it is zero the number of impacts changes.
     - `error`: estimated standard error of `max_rotation` from rounding and tolerance [rad]; infinite if overturned.
+    - `known_until`: time after which the block follows one of many motions that errors of the computation allow [s];
+      infinite if there is none. Impacts after it are those of one of these motions.
     - `status`: a `Status`. With any other than successful the numbers are not results.
 
     The margin is the smallest squared distance from standing still in balance (Voyagaki et al. 2012, 3.11), (velocity/p
@@ -72,16 +82,20 @@ class Outcome(AbstractTable):
     max_velocity: Real
     time_of_max: Real
     impact_count: Int[Array, "..."]
+    large_impact_count: Int[Array, "..."]
     overturned: Bool[Array, "..."]
+    overturned_share: Real
     margin: Real
     differentiable: Bool[Array, "..."]
     clearance: Real
     error: Real
+    known_until: Real
     status: Status
 
     @property
     def _columns(self):
         units = {"max_rotation": "rad", "max_velocity": "rad/s", "time_of_max": "s", "clearance": "rad", "error": "rad"}
+        units["known_until"] = "s"
         axes = scenes(self.max_rotation.ndim)
         return {name: Column(axes, getattr(self, name), units.get(name, "-")) for name in self.__dataclass_fields__}
 
@@ -162,31 +176,53 @@ def outcome(
 def _outcome(block, motion, model, initial, engine) -> Outcome:
     scene = block, motion, model, initial, engine
     if engine.reverse:
-        return _by_steps(scene)
+        return _in_reverse(scene)
     check_single(block=block, motion=motion)
     if not isinstance(engine, Series):
         return lane_function(
-            _by_steps, reverse=_on_tape, key="outcome", results=outcome_like, in_lanes=True, refill=True
+            _by_steps, reverse=_in_reverse, key="outcome", results=outcome_like, in_lanes=True, refill=True
         )(scene)
     passes = _OutcomePasses(rounds=POLICY.is_record(motion.knots.size - 1))
-    return lane_function(passes, reverse=_on_tape, key="outcome", results=outcome_like)(scene)
+    return lane_function(passes, reverse=_in_reverse, key="outcome", results=outcome_like)(scene)
 
 
 def _by_steps(scene) -> Outcome:
-    return _to_outcome(*scene, taped=False)
+    *_, engine = scene
+    stepper, state = _begun(scene, engine.stepper)
+    return _outcome_of(conclude_with_copies(stepper, all_moving(state, stepper.scene)))
 
 
-def _on_tape(scene) -> Outcome:
-    return _to_outcome(*scene, taped=True)
+def _in_reverse(scene) -> Outcome:
+    """Compute the outcome so that reverse mode goes through its steps; what copies tell comes without derivatives."""
+    *given, engine = scene
+    taped = not engine.reverse
+    stepper, state = _begun(scene, functools.partial(engine.stepper, taped=taped))
+    state = stepper.end_on_tape(state) if taped else stepper.to_the_end(all_moving(state, stepper.scene))
+    found = _outcome_of(conclude(stepper, state))
+
+    def with_copies():
+        told = _outcome(*stop_gradient(given), engine.forward)
+        return {name: getattr(told, name) for name in TOLD}
+
+    told = {name: stop_gradient(getattr(found, name)) for name in TOLD}
+    told = jax.lax.cond(found.status == Status.undecided, with_copies, lambda: told)
+    return replace(found, **told)
+
+
+def _begun(scene, stepper_of: Callable) -> tuple[Any, State]:
+    block, motion, model, initial, _ = scene
+    scene = Scene.of(block, motion, model)
+    return stepper_of(scene, None, history=False), initial_state(
+        scene, *(jnp.asarray(x, scene.p.dtype) for x in initial)
+    )
 
 
 def outcome_like(scene) -> Outcome:
     """Return the shapes and dtypes of an outcome, from its inputs."""
 
     def made():
-        real, count = jnp.zeros((), jnp.result_type(*jax.tree.leaves(scene[:2]))), jnp.zeros((), jnp.int32)
-        flag = count == 0
-        return Outcome(real, real, real, count, flag, real, flag, real, real, Status.successful)
+        real = jnp.zeros((), jnp.result_type(*jax.tree.leaves(scene[:2])))
+        return _outcome_of(Conclusion.blank(real))
 
     return jax.eval_shape(made)
 
@@ -208,53 +244,15 @@ class _OutcomePasses(TwoPass):
         return fast_loop(point, state, limit)
 
     def accurate(self, point, state):
-        return point.to_the_end(state)
+        return _outcome_of(conclude_with_copies(point, state))
 
     def unfinished(self, point, state):
         return ~state.done & (state.steps < most_steps(point.scene.most_pieces))
 
     def result(self, point, state):
-        result = conclude(point, state)
+        result = _outcome_of(conclude(point, state))
         return result, result.status != Status.successful
 
 
-def _to_outcome(block, motion, model, initial, engine, *, taped: bool) -> Outcome:
-    scene = Scene.of(block, motion, model)
-    stepper = engine.stepper(scene, None, history=False, taped=taped)
-    state = initial_state(scene, *(jnp.asarray(x, scene.p.dtype) for x in initial))
-    return conclude(stepper, stepper.end_on_tape(state) if taped else stepper.to_the_end(all_moving(state, scene)))
-
-
-def has_one_peak(peak: Real, second: Real, clearance: Real, alpha: Real) -> Bool[Array, "..."]:
-    """Return whether neither another peak ties with the highest, nor an impact is grazed before it."""
-    equal = max(1e-9, ROUNDING * float(jnp.finfo(peak.dtype).eps))
-    tie = (peak - second <= equal * peak) & (peak > 0)
-    return ~tie & ~(clearance <= equal * alpha)
-
-
-def conclude(stepper: AbstractStepper, state: State) -> Outcome:
-    """Add the free stage to a state at the end of the motion (or where the block was lost)."""
-    final = stepper.finish(state)
-    overturned = final.overturned
-
-    def unless_overturned(value):
-        return select(overturned, jnp.inf, value)
-
-    # A block that stands still in balance goes nowhere, however many steps it takes.
-    eps = jnp.finfo(state.closeness.dtype).eps
-    unfinished = Status.where(state.closeness > eps, Status.step_budget_exhausted, Status.undecided)
-    is_smooth = has_one_peak(final.peak, final.second, final.peak_clearance, stepper.scene.alpha)
-    margin = select(overturned, -final.closeness_beyond, final.closeness)
-    status = Status.where(state.done, final.status, unfinished)
-    return Outcome(
-        differentiable=is_smooth & ~overturned,
-        clearance=select(overturned, final.clearance, final.peak_clearance),
-        max_rotation=unless_overturned(final.peak),
-        max_velocity=unless_overturned(final.fastest * stepper.scene.p),
-        time_of_max=unless_overturned(final.peak_time),
-        impact_count=final.impacts,
-        overturned=overturned,
-        margin=margin,
-        error=unless_overturned(final.error),
-        status=Status.where(jnp.isnan(margin), Status.not_finite, status),
-    )
+def _outcome_of(found: Conclusion) -> Outcome:
+    return Outcome(**{field.name: getattr(found, field.name) for field in fields(Conclusion)})

@@ -4,23 +4,28 @@ The inputs are a block, a motion, a model, the initial state, the time to stop [
 loop over the steps is machine code where the steps are.
 """
 
-from dataclasses import fields
+from dataclasses import fields, replace
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from equinox.internal import unvmap_any
 from jaxtyping import Array, Bool, Int
 
 from jaxrock._arguments.repr import described
+from jaxrock._core.arrays import is_traced
 from jaxrock._core.types import Real
 from jaxrock.compiler import lane_function
-from jaxrock.compiler.hints import stop_gradient
+from jaxrock.compiler.hints import jit_low_effort, stop_gradient
+from jaxrock.engines.conclusion import Conclusion, conclude
+from jaxrock.engines.copies import TOLD, conclude_with_copies
 from jaxrock.engines.scene import Scene
 from jaxrock.engines.state import Kept, State, initial_state, surpasses
+from jaxrock.engines.stepper import FEW_PIECES
 from jaxrock.engines.trajectory import rows_of, states_of
 from jaxrock.responses.compile_setup import compile_setup, numbers_of
-from jaxrock.responses.outcome import conclude, outcome_like
+from jaxrock.responses.outcome import outcome_like
 from jaxrock.status import Status
 
 
@@ -28,11 +33,15 @@ class Summary(eqx.Module):
     """Summary of a history as a whole (see `Response`)."""
 
     impact_count: Int[Array, "..."]
+    large_impact_count: Int[Array, "..."]
     max_rotation: Real
     max_velocity: Real
     time_of_max: Real
     overturned: Bool[Array, "..."]
+    overturned_share: Real
     margin: Real
+    error: Real
+    known_until: Real
     status: Status
 
     __repr__ = described
@@ -89,13 +98,54 @@ def _summary(given) -> Summary:
     lost = final.overturned
     return Summary(
         impact_count=state.impacts,
+        large_impact_count=state.large_impacts,
         max_rotation=jnp.where(lost, jnp.inf, jnp.maximum(state.peak, state.opening)),
         max_velocity=jnp.where(lost, jnp.inf, state.fastest * stepper.scene.p),
         time_of_max=jnp.where(lost, jnp.inf, jnp.where(higher, stepper.time(state), state.peak_time)),
         overturned=lost,
+        overturned_share=final.overturned_share,
         margin=final.margin,
+        error=final.error,
+        known_until=final.known_until,
         status=final.status,
     )
+
+
+def with_copies(told, summary: Summary) -> Summary:
+    """Return the summary with what copies of the scene tell, where it is undecided."""
+    _, motion, *_ = told
+    undecided = summary.status == Status.undecided
+    if motion.knots.size - 1 <= FEW_PIECES:
+        return summary
+    if not is_traced(undecided):
+        return _with_copies(told, summary) if bool(undecided) else summary
+
+    def found():  # for all lanes, if any needs it
+        return jax.tree.map(lambda a, b: jnp.where(undecided, a, b), _with_copies(told, summary), summary)
+
+    return jax.lax.cond(unvmap_any(undecided), found, lambda: summary)
+
+
+@jit_low_effort(follows_scenes=True)
+def _with_copies(told, summary: Summary) -> Summary:
+    *given, engine = told
+    run = lane_function(
+        _concluded, key="copies of a history", results=_conclusion_like, in_lanes=engine.forward.in_lanes
+    )
+    found = run(stop_gradient((*given, engine.forward)))
+    names = [name for name in ("overturned", *TOLD) if name != "differentiable"]
+    return replace(summary, **{name: getattr(found, name) for name in names})
+
+
+def _concluded(told) -> Conclusion:
+    block, motion, model, initial, stop, engine = told
+    scene = Scene.of(block, motion, model)
+    stepper = engine.stepper(scene, stop.astype(scene.p.dtype), history=False)
+    return conclude_with_copies(stepper, initial_state(scene, *(jnp.asarray(x, scene.p.dtype) for x in initial)))
+
+
+def _conclusion_like(told) -> Conclusion:
+    return jax.eval_shape(lambda: Conclusion.blank(jnp.zeros((), jnp.result_type(*jax.tree.leaves(told[:2])))))
 
 
 def _summary_like(given) -> Summary:

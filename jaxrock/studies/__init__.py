@@ -14,10 +14,10 @@ from jaxrock.studies.borders import (
     overturning_borders as overturning_borders,
 )
 from jaxrock.studies.critical import (
-    Critical as Critical,
     critical_amplitudes as critical_amplitudes,
     critical_durations as critical_durations,
 )
+from jaxrock.studies.critical_ends import Critical as Critical
 from jaxrock.studies.sensitivities import (
     Sensitivity as Sensitivity,
     SensitivityMap as SensitivityMap,
@@ -28,11 +28,11 @@ from jaxrock.studies.sensitivities import (
 )
 from jaxrock.studies.spectra import (
     OverturningMap as OverturningMap,
-    Spectrum as Spectrum,
     overturning_map as overturning_map,
     rocking_spectrum as rocking_spectrum,
     self_similar_spectrum as self_similar_spectrum,
 )
+from jaxrock.studies.spectrum import Spectrum as Spectrum
 from jaxrock.sweeps.devices import use_cpu_devices as use_cpu_devices
 from jaxrock.sweeps.grid import Grid as Grid
 

@@ -18,6 +18,7 @@ from jaxrock._arguments.tables import AbstractTable, Column
 from jaxrock._core.arrays import Values, shown, to_device
 from jaxrock._core.precision import frames_of_the_package
 from jaxrock._core.progress import Progress
+from jaxrock._core.renamed import renamed
 from jaxrock.blocks.asymmetric import AsymmetricBlock
 from jaxrock.blocks.rigid import Block
 from jaxrock.blocks.rock import Rock
@@ -27,7 +28,7 @@ from jaxrock.models.rigid import Housner
 from jaxrock.motions.components import Components
 from jaxrock.motions.record import with_room
 from jaxrock.responses.current_model import current_model
-from jaxrock.studies.suite_scenes import STOOD, TOPPLED, UNDECIDED, of_motion, rising_scales, stacked
+from jaxrock.studies.suite_scenes import STOOD, TOPPLED, UNDECIDED, Scenes, of_motion, rising_scales, stacked
 
 
 class AzimuthOutcomes(AbstractTable):
@@ -35,20 +36,22 @@ class AzimuthOutcomes(AbstractTable):
 
     - `azimuth`: (azimuths,) of the planes, in the rock's axes [rad]; `scale`: (scales,) of the record.
     - `blocks`: planar block of the rock in each plane, with parameters of shape (azimuths,).
-    - `verdict`, `rotation`, `margin`: (azimuths, scales), as in `SuiteOutcomes`.
+    - `verdict`, `rotation_ratio`, `margin`: (azimuths, scales), as in `SuiteOutcomes`.
     """
 
     azimuth: Float[np.ndarray, " azimuths"]
     scale: Float[np.ndarray, " scales"]
     blocks: Block | AsymmetricBlock
     verdict: Int8[np.ndarray, "azimuths scales"]
-    rotation: Float[np.ndarray, "azimuths scales"]
+    rotation_ratio: Float[np.ndarray, "azimuths scales"]
     margin: Float[np.ndarray, "azimuths scales"]
+
+    rotation = renamed("rotation", "rotation_ratio")
 
     @property
     def _columns(self):
         axes = {"azimuth": Column(("azimuth",), self.azimuth, "rad"), "scale": Column(("scale",), self.scale)}
-        results = {"verdict": self.verdict, "rotation_over_alpha": self.rotation, "margin": self.margin}
+        results = {"verdict": self.verdict, "rotation_ratio": self.rotation_ratio, "margin": self.margin}
         return axes | {name: Column((*axes,), values) for name, values in results.items()}
 
     @property
@@ -115,8 +118,8 @@ def azimuth_outcomes(
         lanes = jax.tree.map(lambda x, own, at=index: x[at] if own else np.full(scales.shape, x[at]), known, alike)
         found.append(of_motion(with_room(motion), to_device(lanes), to_device(scales), model, engine))
         bar.add(scales.size)
-    parts = (np.stack([np.asarray(x) for x in part]) for part in zip(*found))
-    return AzimuthOutcomes(angles, scales, blocks, *parts)
+    parts = Scenes(*(np.stack([np.asarray(x) for x in part]) for part in zip(*found)))
+    return AzimuthOutcomes(angles, scales, blocks, parts.verdict, parts.rotation, parts.margin)
 
 
 def _blocks(rock: Rock | Callable, angles: np.ndarray) -> Block | AsymmetricBlock:

@@ -18,8 +18,8 @@ import numpy as np
 
 from jaxrock._arguments.annotations import arguments
 from jaxrock._core.arrays import is_traced
-from jaxrock.status import Status
 from jaxrock.studies.ends import brackets_of, roots_of
+from jaxrock.studies.search_axis import known_margin
 from jaxrock.studies.spectra import OverturningMap, under_pulse
 from jaxrock.sweeps.runner import cheap_per_point
 from jaxrock.sweeps.sweep import surface
@@ -170,7 +170,7 @@ class _Search(NamedTuple):
     budget: _Budget = _Budget(None)
 
     def at(self, z: np.ndarray, ratio: np.ndarray) -> tuple:
-        """Margin, its slope and the number of impacts at pairs of log intensity `z` and frequency ratio."""
+        """Margin, slope, impacts and openness at pairs of log intensity `z` and frequency ratio."""
         self.budget.take(z.size)
         return tuple(map(np.asarray, surface(_point, (z, ratio), self.scene, "borders", self.progress, outer=False)))
 
@@ -188,7 +188,9 @@ class _Search(NamedTuple):
         def at(z, index):
             return ask(z, ratio[index])
 
-        ends = roots_of(at, brackets_of(at, grid)[0])
+        brackets, told = brackets_of(at, grid)
+        ends = roots_of(at, brackets)
+        failed.update(ratio[~told["complete"]].tolist(), ratio[ends["index"][~ends["known"]]].tolist())
         first, last = (ask(np.full(ratio.size, edge), ratio) for edge in (grid[0, 0], grid[0, -1]))
         found = [self._ends(grid[0], first, last, ends, k) for k in range(ratio.size)]
         rows = [[(*pair, x) for pair in pairs] for x, pairs in zip(ratio.tolist(), found)]
@@ -242,15 +244,15 @@ def _parts(row: tuple, cuts: dict[tuple, float]) -> list[_Interval]:
 
 @cheap_per_point
 def _point(z, ratio, scene):
-    """Margin, its slope by z and impacts of a block under a pulse of intensity e^z."""
+    """Margin, slope by z, impacts and whether the verdict is open, of a block under a pulse of intensity e^z."""
 
     def margin(z):
         result, _ = under_pulse(jnp.exp(z), ratio, scene)
         return result.margin, result
 
     margin, slope, result = jax.jvp(margin, (z,), (jnp.ones_like(z),), has_aux=True)
-    decided = (result.status == Status.successful) | (result.status == Status.undecided)
-    return jnp.where(decided, margin, jnp.nan), slope, result.impact_count
+    margin, is_open = known_margin(margin, result.status)
+    return margin, slope, result.impact_count, is_open
 
 
 def _pairs(here: list[_Interval], there: list[_Interval], strict: bool) -> list[tuple[int, int]]:

@@ -11,8 +11,9 @@ def an_outcome() -> Outcome:
     """Return an outcome with arbitrary numbers."""
     number, count, verdict = jnp.zeros(()), jnp.zeros((), int), jnp.zeros((), bool)
     return Outcome(
-        max_rotation=number, max_velocity=number, time_of_max=number, impact_count=count, overturned=verdict,
-        margin=number, differentiable=verdict, clearance=number, error=number, status=Status.successful,
+        max_rotation=number, max_velocity=number, time_of_max=number, impact_count=count, large_impact_count=count,
+        overturned=verdict, overturned_share=number, margin=number, differentiable=verdict, clearance=number,
+        error=number, known_until=number, status=Status.successful,
     )  # fmt: skip
 
 

@@ -17,8 +17,21 @@ from jaxrock.engines.stepper import AbstractEngine
 from jaxrock.models.equation import AbstractEquation, Angle
 from jaxrock.models.user_equation import Equation
 from jaxrock.responses.outcome import outcome
-from jaxrock.status import Status
+from jaxrock.status import Status, is_decided
 from jaxrock.studies.parameters import named, rebuilt, scaled_motion
+
+_NEAR = 1e-2  # margin of a scene that is near its balance
+
+
+def known_margin(margin, status: Status):
+    """Return the margin, NaN where the scene was not computed, and whether its verdict is open.
+
+    A verdict that holds counts, however chaotic the peak. Two kinds of scenes are too close to call: those near their
+    balance, and those that chaos leaves open. Near the balance the margin is zero within its error, which a search for
+    its zeros closes in on, so those count, too. How near errors leave it open depends on the engine.
+    """
+    is_close = status == Status.undecided
+    return jnp.where(is_decided(status) | is_close, margin, jnp.nan), is_close & ~(abs(margin) < _NEAR)
 
 
 class AbstractVaried(eqx.Module):
@@ -53,12 +66,12 @@ class AbstractVaried(eqx.Module):
         return result.margin, result
 
     def at(self, z, block, motion):
-        """Return the margin (NaN where it is unknown), its slope, and the number of impacts."""
+        """Return the margin (NaN where unknown), its slope, the number of impacts, and whether the verdict is open."""
         margin, slope, result = jax.jvp(
             lambda z: self.margin(z, block, motion), (z,), (jnp.ones_like(z),), has_aux=True
         )
-        decided = (result.status == Status.successful) | (result.status == Status.undecided)
-        return jnp.where(decided, margin, jnp.nan), slope, result.impact_count
+        margin, is_open = known_margin(margin, result.status)
+        return margin, slope, result.impact_count, is_open
 
     def slopes(self, z, block, motion):
         """Return derivatives of the logarithm of the critical value by the parameters."""

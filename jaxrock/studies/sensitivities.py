@@ -23,7 +23,7 @@ from jaxrock.motions.motion import AbstractMotion
 from jaxrock.motions.pulses.exponential import ExponentialPulse
 from jaxrock.responses.current_model import current_model
 from jaxrock.responses.outcome import Outcome, outcome
-from jaxrock.status import Enumeration, Status, item
+from jaxrock.status import Enumeration, Status, is_decided, item
 from jaxrock.studies.parameters import named, rebuilt
 from jaxrock.studies.spectra import axis, scaled_law
 from jaxrock.sweeps.runner import cheap_per_point
@@ -35,8 +35,9 @@ class SlopeStatus(Enumeration):
 
     useful = item("A linear step says what comes of changes that are much smaller than `reach`.")
     useless = item(
-        "Right, and useless: a relative change of a thousandth of the parameters, or of less, uses up all that this "
-        "result can change by, so that no step along its slope predicts anything. What many scenes do together is "
+        "Useless: a relative change of a thousandth of the parameters, or of less, uses up all that this result can "
+        "change by, so that no step along its slope predicts anything; where chaotic rocking makes rounding errors do "
+        "that before the result, slopes are NaN. What many scenes do together is "
         "smooth: shares that topple of blocks with scatter (`hazard.simulated_fragility` of `blocks.draw_blocks`, "
         "`inverse.calibrate_block`) and likelihoods that know of scatter (`inverse.log_density`)."
     )
@@ -71,8 +72,8 @@ class Sensitivity(AbstractTable):
     - `names`, `values`: the parameters; the last, where the motion is a pulse or a record, is `uplift_strength`.
     - `max_rotation`, `max_velocity`, `margin`: `Slopes` of [rad], [rad/s], [-].
     - `outcome`: the response itself.
-    - `valid`: whether the derivatives of `max_rotation` describe the response: computed, not overturned, and smooth
-      here (`Outcome.differentiable`). Where it is false they are NaN.
+    - `valid`: whether the derivatives of `max_rotation` describe the response: computed, not overturned, smooth here
+      (`Outcome.differentiable`), and its peak before `Outcome.known_until`. Where it is false they are NaN.
     - `condition`: length of the vector of elasticities of `max_rotation`: relative errors grow by at most that factor.
     - `graze_distance`: relative change of all parameters together, in the worst direction and to first order, that
       makes a grazing impact appear or vanish before the peak. This changes the number of impacts. Infinite if the block
@@ -158,7 +159,10 @@ def _sensitivity(block, motion, model, engine) -> Sensitivity:
 
 def _told(names: tuple[str, ...], values, threshold, rows, result: Outcome) -> Sensitivity:
     """Build the `Sensitivity` from derivatives (results, parameters) at the values of the parameters."""
-    valid = (result.status == Status.successful) & result.differentiable
+    decided = is_decided(result.status)
+    # A peak after the time at which errors have outgrown the rotation is that of one of many motions.
+    lost = (result.status == Status.chaotic) | (result.time_of_max > result.known_until)
+    known, valid = decided & ~lost, decided & ~lost & result.differentiable
     # uplift_strength = threshold/amplitude: d/d ln strength = -d/d ln amplitude.
     amplitude = values[names.index("amplitude")]
     strength = threshold / jnp.abs(amplitude)
@@ -166,12 +170,10 @@ def _told(names: tuple[str, ...], values, threshold, rows, result: Outcome) -> S
     independent = len(names)
     values = jnp.append(values, strength)
 
-    successful = result.status == Status.successful
-
     def steepest(name):
         return jnp.linalg.norm((rows[_RESULTS.index(name)] * values)[:independent])
 
-    def slopes(name, known, range_=0.0):
+    def slopes(name, known, missing, range_=0.0):
         value, row, steep = getattr(result, name), rows[_RESULTS.index(name)], steepest(name)
         relative = row[:independent] * values[:independent] / jnp.where(value == 0, 1.0, value)
         relative = jnp.append(relative, -relative[names.index("amplitude")])  # also of an infinite strength
@@ -179,8 +181,8 @@ def _told(names: tuple[str, ...], values, threshold, rows, result: Outcome) -> S
         reach = jnp.where(flat, jnp.inf, jnp.maximum(jnp.abs(value), range_) / jnp.where(flat, 1.0, steep))
         row, relative, reach = (jnp.where(known, x, jnp.nan) for x in (row, relative, reach))
         status = SlopeStatus.where(reach < _USELESS, SlopeStatus.useless, SlopeStatus.useful)
-        missing = ~successful | ~known & result.overturned
         status = SlopeStatus.where(known, status, SlopeStatus.not_smooth)
+        status = SlopeStatus.where(lost, SlopeStatus.useless, status)
         status = SlopeStatus.where(missing, SlopeStatus.missing, status)
         return Slopes(value, row, relative, reach, status)
 
@@ -188,15 +190,16 @@ def _told(names: tuple[str, ...], values, threshold, rows, result: Outcome) -> S
         """Return, to first order, the relative change of all parameters together that makes a result zero."""
         steep = steepest(name)
         far = (steep == 0) | (value == jnp.inf)
-        return jnp.where(successful, jnp.where(far, jnp.inf, jnp.abs(value) / jnp.where(far, 1.0, steep)), jnp.nan)
+        return jnp.where(known, jnp.where(far, jnp.inf, jnp.abs(value) / jnp.where(far, 1.0, steep)), jnp.nan)
 
-    rotation = slopes("max_rotation", valid)
+    without_peak = ~decided | result.overturned
+    rotation = slopes("max_rotation", valid, without_peak)
     return Sensitivity(
         names=(*names, "uplift_strength"),
         values=values,
         max_rotation=rotation,
-        max_velocity=slopes("max_velocity", valid),
-        margin=slopes("margin", successful, 1.0),
+        max_velocity=slopes("max_velocity", valid, without_peak),
+        margin=slopes("margin", known, ~decided, 1.0),
         outcome=result,
         valid=valid,
         condition=jnp.linalg.norm(rotation.elasticity[:independent]),

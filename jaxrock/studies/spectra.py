@@ -14,7 +14,9 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int
 from jaxrock._arguments.annotations import arguments
 from jaxrock._arguments.ranges import Range, not_nan, ratio
 from jaxrock._arguments.tables import AbstractTable, Column
-from jaxrock._core.arrays import Values
+from jaxrock._core.arrays import Values, is_traced, to_device
+from jaxrock._core.progress import Progress
+from jaxrock._core.renamed import renamed
 from jaxrock.blocks.restitution import AbstractRestitution, Restitution
 from jaxrock.blocks.rigid import Block
 from jaxrock.compiler import trace_function
@@ -23,56 +25,14 @@ from jaxrock.models.equation import AbstractEquation
 from jaxrock.models.rigid import Housner
 from jaxrock.motions.motion import AbstractMotion
 from jaxrock.motions.pulses.sinusoidal import SinePulse
+from jaxrock.motions.record import with_room
+from jaxrock.motions.suite import Suite, warn_of_repeated
 from jaxrock.responses.current_model import current_model
 from jaxrock.responses.outcome import Outcome, outcome
-from jaxrock.status import Status
+from jaxrock.status import Status, is_decided
+from jaxrock.studies.spectrum import Spectrum
 from jaxrock.sweeps.runner import cheap_per_point
 from jaxrock.sweeps.sweep import surface
-
-
-class Spectrum(AbstractTable):
-    """A rocking spectrum; every result has the shape (..., len(abscissa)).
-
-    - `abscissa`: 2 pi/p [s], or the frequency ratio omega/p [-] of a self-similar spectrum.
-    - `max_rotation`: peak |rotation| over alpha [-]; infinite where the block overturned.
-    - `max_velocity`: peak |angular velocity| over p alpha [-]; infinite where the block overturned.
-    - `impact_count`, `overturned`, `margin`, `status`: as in `Outcome`.
-    - `intensity`: peak acceleration over the uplift threshold [-], one per row (self-similar spectrum), or None.
-    - `parameters`: further axes of a self-similar spectrum, in front of the rows, by the pulse's names.
-    """
-
-    abscissa: Float[Array, " n"]
-    max_rotation: Float[Array, "*rows n"]
-    max_velocity: Float[Array, "*rows n"]
-    impact_count: Int[Array, "*rows n"]
-    overturned: Bool[Array, "*rows n"]
-    margin: Float[Array, "*rows n"]
-    status: Status
-    intensity: Float[Array, " rows"] | None = None
-    parameters: dict[str, Float[Array, " _"]] = eqx.field(default_factory=dict)
-
-    @property
-    def pulse_duration(self) -> Float[Array, " n"] | None:
-        """p times the duration (or period) of the pulse [-], 2 pi/abscissa; None of a rocking spectrum."""
-        return None if self.intensity is None else 2 * jnp.pi / self.abscissa
-
-    @property
-    def uplift_strength(self) -> Float[Array, " rows"] | None:
-        """Uplift threshold over the peak acceleration [-], 1/intensity; None of a rocking spectrum."""
-        return None if self.intensity is None else 1 / self.intensity
-
-    @property
-    def _columns(self):
-        rocking = self.intensity is None
-        across = "abscissa" if rocking else "frequency_ratio"
-        axes = (*self.parameters, *(() if rocking else ("intensity",)), across)
-        results = ("max_rotation", "max_velocity", "impact_count", "overturned", "margin", "status")
-        return {
-            **{name: Column((name,), values) for name, values in self.parameters.items()},
-            "intensity": Column(("intensity",), self.intensity),
-            across: Column((across,), self.abscissa, "s" if rocking else "-"),
-            **{name: Column(axes, getattr(self, name)) for name in results},
-        }
 
 
 class OverturningMap(AbstractTable):
@@ -81,7 +41,7 @@ class OverturningMap(AbstractTable):
     - `frequency_ratio`: omega/p [-]; `intensity`: peak acceleration over the uplift threshold [-].
     - `parameters`: further axes, in front of these, by the pulse's names.
     - `state`: 0 safe, 1 overturned without impact, 2 overturned after impacts, -1 not computed (see `status`).
-    - `max_rotation`: peak |rotation| over alpha [-]; infinite where the block overturned.
+    - `rotation_ratio`: peak |rotation| over alpha [-]; infinite where the block overturned.
     - `impact_count`, `margin`, `status`: as in `Outcome`.
     - `scene`: slenderness, restitution, pulse, model and engine of the map, for `overturning_borders`.
     """
@@ -89,12 +49,19 @@ class OverturningMap(AbstractTable):
     frequency_ratio: Float[Array, " columns"]
     intensity: Float[Array, " rows"]
     state: Int[Array, "*more rows columns"]
-    max_rotation: Float[Array, "*more rows columns"]
+    rotation_ratio: Float[Array, "*more rows columns"]
     impact_count: Int[Array, "*more rows columns"]
     margin: Float[Array, "*more rows columns"]
     status: Status
     parameters: dict[str, Float[Array, " _"]] = eqx.field(default_factory=dict)
     scene: Any = None
+
+    max_rotation = renamed("max_rotation", "rotation_ratio")
+
+    @property
+    def overturned(self) -> Bool[Array, "*more rows columns"]:
+        """Verdict of each block; False where `state` is -1, not computed."""
+        return jnp.asarray(self.state > 0)
 
     @property
     def pulse_duration(self) -> Float[Array, " columns"]:
@@ -109,7 +76,7 @@ class OverturningMap(AbstractTable):
     @property
     def _columns(self):
         axes = (*self.parameters, "intensity", "frequency_ratio")
-        results = ("state", "max_rotation", "impact_count", "margin", "status")
+        results = ("state", "rotation_ratio", "impact_count", "overturned", "margin", "status")
         return {
             **{name: Column((name,), values) for name, values in self.parameters.items()},
             **{name: Column((name,), getattr(self, name)) for name in axes[-2:]},
@@ -120,7 +87,7 @@ class OverturningMap(AbstractTable):
 @arguments
 def rocking_spectrum(
     alpha: ArrayLike,
-    motion: AbstractMotion,
+    motion: AbstractMotion | Suite,
     period: Values,
     restitution: Restitution | None = None,
     model: AbstractEquation = Housner(),
@@ -128,17 +95,18 @@ def rocking_spectrum(
     engine: AbstractEngine | None = None,
     progress: bool | None = None,
 ) -> Spectrum:
-    """Compute the peak response of blocks of one slenderness and every size under one motion.
+    """Compute the peak response of blocks of one slenderness and every size under one motion, or those of a suite.
 
     **Arguments:**
 
     - `alpha`: slenderness angle [rad], in (0, pi/2).
-    - `motion`: any motion.
+    - `motion`: any motion, or a `Suite`; a suite's motions run one after the other, and share programs.
     - `period`: (n,) values of 2 pi/p [s], positive.
     - `restitution`, `model`, `engine`: as in `Block` and `outcome`.
     - `progress`: whether to draw a progress bar; None: on a terminal, if it takes long.
 
-    **Returns:** a `Spectrum` over the periods.
+    **Returns:** a `Spectrum` over the periods; of a suite, with an axis of motions in front: results (motions, n). A
+    repeated motion of a suite causes a warning.
     With traced arguments (within `jax.jit`, `jax.vmap`, `jax.grad`) it is a plain function of arrays.
 
     **Raises:** ValueError for arguments outside their ranges.
@@ -148,8 +116,23 @@ def rocking_spectrum(
     period = axis("period", period, _period)
     block = of_any_size(alpha, restitution)  # raises here, where values are concrete
 
-    scene = block.alpha, block.law, motion, current_model(model, block, motion, period), engine
-    return Spectrum(period, **surface(_under_motion, (period,), scene, "spectrum", progress, names=_PEAKS))
+    def under(motion, progress):
+        scene = block.alpha, block.law, motion, current_model(model, block, motion, period), engine
+        return surface(_under_motion, (period,), scene, "spectrum", progress, names=_PEAKS)
+
+    if not isinstance(motion, Suite):
+        return Spectrum(period, **under(motion, progress))
+    warn_of_repeated(motion)
+    bar, found = Progress(len(motion), "records", progress), []
+    for each in motion.motions():
+        found.append(under(with_room(each), False))
+        bar.add(1)
+    return Spectrum(period, **jax.tree.map(_stacked, *found), motions=motion.names)
+
+
+def _stacked(*results: Array) -> Array:
+    """Stack results of several motions; NumPy stacks known ones, as JAX would compile a program for each number."""
+    return jnp.stack(results) if is_traced(results) else to_device(np.stack([np.asarray(x) for x in results]))
 
 
 @arguments
@@ -331,8 +314,8 @@ def axis(name: str, values: Values, allowed: Range = ratio) -> Float[Array, " n"
 
 # Results of an outcome that a surface keeps. They are computed with it, point by point. Spectra and maps compute the
 # same ones, so a spectrum and a map of one pulse are one program.
-_PEAKS = ("max_rotation", "max_velocity", "impact_count", "overturned", "margin", "status")
-_STATES = ("state", "max_rotation", "impact_count", "margin", "status")
+_PEAKS = ("rotation_ratio", "velocity_ratio", "impact_count", "overturned", "margin", "status")
+_STATES = ("state", "rotation_ratio", "impact_count", "margin", "status")
 
 
 def _over(value: Array, size: Array) -> Array:
@@ -344,10 +327,12 @@ def _over(value: Array, size: Array) -> Array:
 def _kept(result: Outcome, block: Block) -> dict:
     """Return the results that a spectrum or a map keeps of an outcome."""
     rest = {name: getattr(result, name) for name in ("impact_count", "overturned", "margin", "status")}
-    velocity = _over(result.max_velocity, block.p * block.alpha)
+    ratios = {
+        "rotation_ratio": _over(result.max_rotation, block.alpha),
+        "velocity_ratio": _over(result.max_velocity, block.p * block.alpha),
+    }
     state = jnp.where(result.overturned, jnp.where(result.impact_count > 0, 2, 1), 0)
-    state = jnp.where(result.status == Status.successful, state, -1)
-    return {"state": state, "max_rotation": _over(result.max_rotation, block.alpha), "max_velocity": velocity, **rest}
+    return {"state": jnp.where(is_decided(result.status), state, -1), **ratios, **rest}
 
 
 # Functions of surfaces. Arguments shared by all points lie in the scene, a pytree, so a second surface of a kind is not

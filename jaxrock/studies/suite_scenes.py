@@ -10,7 +10,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import ArrayLike
+from jaxtyping import Array, ArrayLike
 
 from jaxrock._arguments.parameters import leaves_of, one_of_many, shared
 from jaxrock._arguments.ranges import size
@@ -25,10 +25,11 @@ from jaxrock.motions.mirrored import scaled_and_mirrored
 from jaxrock.motions.record import with_room
 from jaxrock.motions.suite import Suite
 from jaxrock.responses.current_model import current_model
-from jaxrock.responses.outcome import outcome
-from jaxrock.status import Status
+from jaxrock.responses.outcome import Outcome, outcome
+from jaxrock.status import Status, is_decided
 
 STOOD, TOPPLED, UNDECIDED = 0, 1, -1
+BOUNDS = ("lower", "upper", "share")  # ways to count undecided scenes: none, all, or the share that topples
 FACINGS = {"one": (1,), "both": (1, -1)}  # signs of the horizontal motion
 
 
@@ -39,11 +40,28 @@ class Scenes(NamedTuple):
     - `rotation`: peak rotation over slenderness (of an asymmetric block over the smaller one); infinite if it toppled,
       NaN where undecided.
     - `margin`: as in `Outcome`; NaN where undecided.
+    - `share`: share that topples of the motions that errors of the computation allow: 0 or 1 with a verdict, 0.5 where
+      nothing is known.
     """
 
     verdict: np.ndarray
     rotation: np.ndarray
     margin: np.ndarray
+    share: np.ndarray
+
+
+def verdict_and_share(result: Outcome) -> tuple[Array, Array]:
+    """Return the verdict of a scene, and the share that topples, as `Scenes` documents them."""
+    good = is_decided(result.status)
+    verdict = jnp.where(good, jnp.where(result.overturned, TOPPLED, STOOD), UNDECIDED).astype(jnp.int8)
+    share = jnp.where(good | (result.status == Status.undecided), result.overturned_share, jnp.nan)
+    return verdict, jnp.nan_to_num(share, nan=0.5)
+
+
+def topples(verdict: np.ndarray, how: str, share: np.ndarray | None) -> np.ndarray:
+    """Return how much of each scene counts as toppled; `how` is one of `BOUNDS`, `share` None: one half where open."""
+    of_open = {"lower": 0.0, "upper": 1.0, "share": 0.5 if share is None else share}[how]
+    return np.where(verdict == UNDECIDED, of_open, verdict == TOPPLED)
 
 
 def stacked(block: Block | AsymmetricBlock) -> Block | AsymmetricBlock:
@@ -126,9 +144,10 @@ def of_motion(motion, blocks, factors, model, engine) -> Scenes:
         block = one_of_many(blocks, lane)
         result = outcome(block, scaled_and_mirrored(motion, factor), model, engine=engine)
         alpha = jnp.minimum(block.alpha1, block.alpha2) if isinstance(block, AsymmetricBlock) else block.alpha
-        good = result.status == Status.successful
-        verdict = jnp.where(good, jnp.where(result.overturned, TOPPLED, STOOD), UNDECIDED).astype(jnp.int8)
-        rotation, margin = (jnp.where(good, x, jnp.nan) for x in (result.max_rotation / alpha, result.margin))
-        return Scenes(verdict, rotation, margin)
+        verdict, share = verdict_and_share(result)
+        rotation, margin = (
+            jnp.where(verdict == UNDECIDED, jnp.nan, x) for x in (result.max_rotation / alpha, result.margin)
+        )
+        return Scenes(verdict, rotation, margin, share)
 
     return jax.vmap(one)(jnp.arange(factors.size), factors)

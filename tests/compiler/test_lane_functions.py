@@ -28,7 +28,7 @@ class _Passes(TwoPass):
         return jnp.where(point[0] >= point[1], point[0] ** 2, jnp.nan), point[0] >= point[1]
 
     def accurate(self, point, state):
-        return point[0] ** 2, state[0] > -jnp.inf
+        return self.result(point, (point[0] ** 2, state[0] > -jnp.inf))[0]
 
     def unfinished(self, point, state):
         return state[0] < -jnp.inf

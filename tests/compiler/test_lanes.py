@@ -45,7 +45,7 @@ def passes(round):
             return follow(point, state, limit, True)
 
         def accurate(self, point, state):
-            return follow(point, state, 1000, False)
+            return conclude(point, follow(point, state, 1000, False))[0]
 
         def unfinished(self, point, state):
             return state[0] < jnp.round(point["x"])

@@ -60,7 +60,7 @@ class TwoPass(abc.ABC):
 
     @abc.abstractmethod
     def accurate(self, point: Any, state: Any) -> Any:
-        """Return the state where it is finished."""
+        """Return the result of following the state with care."""
 
     @abc.abstractmethod
     def unfinished(self, point: Any, state: Any) -> Any:
@@ -68,12 +68,12 @@ class TwoPass(abc.ABC):
 
     @abc.abstractmethod
     def result(self, point: Any, state: Any) -> tuple[Any, Any]:
-        """Return the result, and whether the fast pass rejects the lane."""
+        """Return the result of the fast pass, and whether it rejects the lane."""
 
     def accurate_only(self, tree: Any) -> Any:
         """Return the result of the accurate pass."""
         point, state = self.init(tree)
-        return self.result(point, self.accurate(point, state))[0]
+        return self.accurate(point, state)
 
     def fast_only(self, tree: Any) -> tuple[Any, Any]:
         """Return the result of the fast pass, and whether it rejects the lane."""

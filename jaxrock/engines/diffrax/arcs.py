@@ -36,6 +36,7 @@ from jaxrock.engines.diffrax.guards import (
     field,
     field_of_trials,
     first_guard,
+    first_solver_state,
     first_step,
     is_hop,
     usual_step,
@@ -132,6 +133,8 @@ class Diffrax(AbstractEngine):
         """Return whether reverse mode differentiates this engine's own loops: with every adjoint but `ForwardMode`."""
         return not isinstance(self.adjoint, diffrax.ForwardMode)
 
+    forward = property(lambda x: Diffrax(x.solver, x.rtol, x.atol, x.controller, max_solves=x.max_solves))
+
     @property
     def in_lanes(self) -> bool:
         """Return whether machine code runs the solve of an arc: unless reverse mode differentiates it."""
@@ -191,21 +194,13 @@ class Diffrax(AbstractEngine):
             dt0=None if isinstance(controller, StepControl) else first,
             y0=y0,
             args=arc,
-            solver_state=self._begun(term, zero, y0, arc),
+            solver_state=first_solver_state(self.solver, term, zero, y0, arc),
             stepsize_controller=controller,
             event=event,
             adjoint=self.adjoint,
             max_steps=DIFFRAX_POLICY.solve_steps,
             throw=False,
         )
-
-    def _begun(self, term: diffrax.ODETerm, zero: Scalar, y0: Pair, arc: ArcProblem) -> PyTree:
-        """Return a solver state with its first stage evaluated, where the solver reuses the last stage (FSAL).
-        Otherwise every step has a stage that only the first needs."""
-        solver = self.solver
-        if not isinstance(solver, diffrax.AbstractERK) or solver.init(term, zero, zero, y0, arc) is None:
-            return None
-        return jnp.array(False), term.vf(zero, y0, arc)
 
     def locate(
         self, arc: ArcProblem, limits: tuple[Scalar, Scalar], length: Scalar, event: diffrax.Event
@@ -268,7 +263,8 @@ class ArcStepper(AbstractStepper):
         turned = turned & (after.impact_time > scene.motion.end)
         if scene.far is not None:
             turned = turned & self._outdone(after)
-        return replace(after, done=after.done | turned | (after.status != Status.successful))
+        goes = (after.status == Status.successful) | (after.status == Status.undecided) & self.has_copies
+        return replace(after, done=after.done | turned | ~goes)
 
     def _outdone(self, state: State) -> Flag:
         """Return whether an asymmetric block that has turned back can neither fall on the other side, nor come higher
@@ -291,6 +287,10 @@ class ArcStepper(AbstractStepper):
         moving = (state.side != 0) & ~state.overturned & (state.piece >= self.scene.pieces)
         state = replace(state, done=~moving | ~state.done, steps=jnp.zeros_like(state.steps))
         return stepper.to_the_end(state)
+
+    @property
+    def follows_free_stage(self) -> bool:
+        return not self.history
 
     def to_the_end(self, state: State) -> State:
         """Advance through the free stage, too; impacts there count only if the block overturns after them."""

@@ -7,7 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optimistix as optx
-from jaxtyping import Array, Inexact, Int
+from jaxtyping import Array, Inexact, Int, PyTree
 
 from jaxrock._core.types import Flag, Scalar
 from jaxrock.compiler.hints import select
@@ -331,3 +331,15 @@ class Illinois(optx.AbstractRootFinder):
     def postprocess(self, fn, y, aux, args, options, state, tags, result):
         """Return the last point."""
         return y, aux, {}
+
+
+def first_solver_state(
+    solver: diffrax.AbstractSolver, term: diffrax.ODETerm, zero: Scalar, y0: Pair, arc: ArcProblem
+) -> PyTree:
+    """Return a solver state with its first stage evaluated, where the solver reuses the last stage (FSAL).
+
+    Otherwise every step has a stage that only the first needs.
+    """
+    if not isinstance(solver, diffrax.AbstractERK) or solver.init(term, zero, zero, y0, arc) is None:
+        return None
+    return jnp.array(False), term.vf(zero, y0, arc)

@@ -43,10 +43,11 @@ from jaxrock.numerics.polynomial import (
     Watch,
     derivative,
     first_event,
+    horner,
     jet,
     keeps_sign,
-    last_size,
     longest,
+    remainder,
     rescaled,
     step_length,
 )
@@ -197,6 +198,7 @@ class TaylorStepper(AbstractStepper):
             error=stop_gradient(select(higher, error, state.error) + lost),
             fastest=jnp.maximum(state.fastest, stage.fastest),
             impacts=state.impacts + stage.impacts,
+            large_impacts=state.large_impacts + stage.impacts,
             status=Status.where(toss_up, Status.undecided, state.status),
         )
 
@@ -248,8 +250,10 @@ class TaylorStepper(AbstractStepper):
         piece, local, over = self.move_on(state, elapsed, full)
         lost = escaped(self, state, start.angle)
         moved = (step.length > 0) & rocking
-        time = select(step.length > 0, step.length * start.stretch, jnp.inf)
-        missed = step.rounded + step.missed, step.rounded + step.missed * jnp.maximum(self.order / time, 1.0)
+        time = select(cut.length > 0, cut.length * start.stretch, jnp.inf)
+        rounded = self.rounding * horner([jnp.abs(c) for c in step.coefficients], cut.length)
+        missed = remainder(step.coefficients, cut.length)
+        missed = rounded + missed, rounded + missed * jnp.maximum(self.order / time, 1.0)
         # A zero-length step keeps the velocity bitwise; its derivatives follow those of coinciding knots.
         kept = select(rocking, with_derivatives_of(state.velocity, velocity), state.velocity)
         exact = landed(self.scene, hits, opening, select(moved, velocity, kept))
@@ -347,8 +351,6 @@ class _Step(NamedTuple):
     coefficients: list[Scalar]
     length: Scalar
     full: Flag  # goes to the end of the room
-    rounded: Scalar  # errors of its end [rad]
-    missed: Scalar
     signs: tuple[Scalar, Scalar]  # initial signs of velocity and acceleration
     monotone: Flag  # the acceleration keeps its sign: at most one turning point
     faster: Flag  # the velocity may exceed the largest so far
@@ -383,8 +385,6 @@ class _Step(NamedTuple):
             coefficients=coefficients,
             length=length,
             full=full,
-            rounded=stepper.rounding * size,
-            missed=last_size(coefficients) * length**order,
             signs=signs,
             monotone=monotone,
             faster=faster,

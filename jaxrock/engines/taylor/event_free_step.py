@@ -61,11 +61,8 @@ def flush_error(stepper: TaylorStepper, state: State, glide: EventFreeSteps, str
     per_time = 1 / select(time > 0, time, 1.0)  # some pieces have zero length
     largest = replace(state, opening=glide.opening, velocity=glide.speed)
     angle, velocity = rounded(stepper, largest, strongest, time / jnp.maximum(count, 1.0))
-    least = 2 * stepper.rounding * stepper.scene.alpha
     missed, faster = 4 * glide.missed, stepper.order * count * per_time
-    spread = state.spread.plus_variance(
-        missed + count * (angle + least) ** 2, missed * faster**2 + count * (velocity + least) ** 2
-    )
+    spread = state.spread.plus_variance(missed + count * angle**2, missed * faster**2 + count * velocity**2)
     spread = spread.after_flow(glide.repulsion * per_time, time)
     return replace(state, spread=StateCovariance.where(supports_divergence(), spread, state.spread))  # else no glides
 

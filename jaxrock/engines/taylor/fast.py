@@ -25,7 +25,7 @@ from jaxrock.engines.taylor.expansion import Start, taylor_expansion
 from jaxrock.engines.taylor.policy import POLICY
 from jaxrock.engines.taylor.step_start import first_sign
 from jaxrock.numerics.newton import is_found, root_between
-from jaxrock.numerics.polynomial import derivative, horner, jet, keeps_sign, last_size, step_length
+from jaxrock.numerics.polynomial import derivative, horner, jet, keeps_sign, last_size, remainder, step_length
 from jaxrock.status import Status
 
 # Degrees of the polynomials for Newton's first iterations, where the series has degree 16 or less (else in proportion).
@@ -213,10 +213,7 @@ def _fastest(start: Start, terms: list[Scalar], part: _Part, at: Scalar, known: 
 def _missed(stepper: TaylorStepper, terms: list[Scalar], at: Scalar, least: Scalar) -> Scalar:
     """Return the truncation error of a step from its last terms; `least`: their bound. A step that ends early has
     less."""
-    if stepper.rounding == stepper.tolerance:
-        return least
-    contributed = last_size(terms) * at**stepper.order
-    return jnp.minimum(least, jnp.maximum(contributed, stepper.rounding / stepper.tolerance * least))
+    return jnp.minimum(least, remainder(terms, at))
 
 
 def _stands(stepper: TaylorStepper, meeting: _Meeting) -> Flag | bool:
@@ -253,7 +250,9 @@ def advance(stepper: TaylorStepper, state: State) -> State:
     piece, local, over = stepper.move_on(state, elapsed, full)
     time = select(at > 0, at * stretch, jnp.inf)  # some pieces have zero length
     missed = _missed(stepper, terms, at, least)
-    errors = 2 * missed, 2 * missed * jnp.maximum(order / time, 1.0)
+    # Later terms are smaller than the first three.
+    rounded = 2 * stepper.rounding * horner([jnp.abs(c) for c in terms[:3]], at)
+    errors = rounded + missed, rounded + missed * jnp.maximum(order / time, 1.0)
     spread = errors_after(stepper, state, start.angle, shaking.now, elapsed, errors)
     passed = replace(
         state,
@@ -292,7 +291,7 @@ def advance(stepper: TaylorStepper, state: State) -> State:
         struck,
         overturned=state.overturned | lost,
         done=struck.done | lost | ~certain,
-        status=Status.where(postponed, Status.undecided, struck.status),
+        status=Status.where(postponed, Status.solver_failed, struck.status),
     )
     return checked_step(stepper, state, after)
 
@@ -341,7 +340,7 @@ def certain_wait(stepper: TaylorStepper, state: State) -> State:
         local=local,
         done=over | never | unclear,
         steps=state.steps + 1,
-        status=Status.where(unclear, Status.undecided, state.status),
+        status=Status.where(unclear, Status.solver_failed, state.status),
     )
     side = select(second, -1.0, 1.0)
     return lift(rested, side, (lifts | meets) & ~unclear & ~never, meets & ~lifts, lifts)

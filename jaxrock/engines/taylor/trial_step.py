@@ -14,7 +14,7 @@ from jaxrock.compiler.hints import materialize_by, select
 from jaxrock.engines.state import State
 from jaxrock.engines.taylor.accurate import TaylorStepper
 from jaxrock.engines.taylor.expansion import Start, taylor_expansion
-from jaxrock.numerics.polynomial import horner, last_size
+from jaxrock.numerics.polynomial import horner, last_size, remainder
 
 # Series of (cosh(x) - 1)/x^2 and (sinh(x) - x)/x^3 in x^2, accurate to rounding up to here.
 _EXACT = 0.04
@@ -65,7 +65,7 @@ def _by_series(stepper: TaylorStepper, start: Start, unit: Scalar, whole: Scalar
     missed, most = last_size(terms) * whole**order, stepper.tolerance * size
     full, half = missed <= most, missed <= 2**order * most
     room = materialize_by(select(full, whole, select(half, 0.5, 0.25) * whole), start.one)
-    missed = missed * select(full, 1.0, select(half, 0.5**order, 0.25**order))
+    holds = full | half | (missed <= 4**order * most)
 
     # Bounds of how far the acceleration departs from its first value, and the velocity from a straight line.
     change = room * horner([k * jnp.abs(c) for k, c in enumerate(speeds)][2:], room)
@@ -76,8 +76,8 @@ def _by_series(stepper: TaylorStepper, start: Start, unit: Scalar, whole: Scalar
         unit=unit,
         room=room,
         full=full,
-        holds=missed <= most,
-        missed=missed,
+        holds=holds,
+        missed=remainder(terms, room),
         opening=horner(terms, room),
         speed=horner(speeds, room),
         slows=speeds[1] < 0,
