@@ -338,7 +338,9 @@ class _Scene(eqx.Module):
             result = outcome(block, _of_strength(motion, level, way), self.model, engine=self.engine)
         rotation = jnp.where(result.overturned, 0.0, result.max_rotation)
         real = still_where(result.status == Status.chaotic, jnp.stack([result.margin, rotation]))
-        share = jnp.where(known_margin(result.margin, result.status)[1], result.overturned_share, jnp.nan)
+        # Without copies (`known_until` is infinite) nothing tells the share.
+        is_open = known_margin(result.margin, result.status)[1] & jnp.isfinite(result.known_until)
+        share = jnp.where(is_open, result.overturned_share, jnp.nan)
         return real, (real, result.overturned, is_decided(result.status), jax.lax.stop_gradient(share))
 
     def rows(self, parameters: Real, level: Real, way: Real, block) -> tuple[Real, _Found]:
