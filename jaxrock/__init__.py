@@ -33,6 +33,7 @@ from jaxrock.models.spring import Spring as Spring
 from jaxrock.motions import intensity as intensity
 from jaxrock.motions.files.example import example_record as example_record
 from jaxrock.motions.files.reading import read_record as read_record
+from jaxrock.motions.harmonic import HarmonicMotion as HarmonicMotion
 from jaxrock.motions.pulses import *  # noqa: F403  (those of files that were added)
 from jaxrock.motions.pulses.exponential import (
     ExponentialPulse as ExponentialPulse,

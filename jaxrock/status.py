@@ -45,7 +45,8 @@ class Status(Enumeration):
     step_budget_exhausted = item(
         "The step budget was used up before the motion ended, usually by impacts that do not die out "
         "(restitution at or near 1). Raise that of the engine (`max_steps`, or `max_solves` of Diffrax); where its "
-        "solver is of low order, raise `atol`."
+        "solver is of low order, raise `atol`. An equation of your own may use it up where its moments jump at some "
+        "angle or velocity: list such angles in `bends`, and smooth the jump, as of k sign(v) to k tanh(v/w)."
     )
     undecided = item(
         "Too close to call: a near balance, a grazing impact or long chaotic rocking makes the response so sensitive "

@@ -56,6 +56,10 @@ def pulse():
     return rk.SinePulse(0.5, 1.0)
 
 
+def bodies(x):
+    return [rk.models.RigidBody(1.0, -2.0 * jnp.sin(0.2 - x), 2.0 * jnp.cos(0.2 - x), x, 1.0)]
+
+
 def record():
     return rk.Record(np.sin(TIMES), 0.01)
 
@@ -172,12 +176,18 @@ RIGID = {"alpha1": 0.2, "alpha2": 0.3}
 
 CALLS: dict[str, Call] = {
     # Blocks and their laws
-    "Block": Call(rk.Block, {"alpha": 0.2, "p": 2.0, "restitution": 0.9}),
+    "Block": Call(rk.Block, {"alpha": 0.2, "p": 2.0, "restitution": 0.9, "opens": "right"}),
     "Block.from_dimensions": Call(
-        rk.Block.from_dimensions, {"width": 0.6, "height": 3.0, "restitution": 0.9, "gravity": 9.81}
+        rk.Block.from_dimensions, {"width": 0.6, "height": 3.0, "restitution": 0.9, "gravity": 9.81, "opens": "left"}
     ),
     "Block.from_radius": Call(
         rk.Block.from_radius, {"alpha": 0.2, "R": 2.0, "restitution": 0.9, "inertia_ratio": 0.7, "gravity": 9.81}
+    ),
+    "Block.from_frame": Call(
+        rk.Block.from_frame, {"width": 0.6, "height": 3.0, "beam": 5.0, "restitution": 0.9, "gravity": 9.81}
+    ),
+    "Block.from_masses": Call(
+        rk.Block.from_masses, {"width": 0.6, "height": 3.0, "top": 2.0, "restitution": 0.9, "gravity": 9.81}
     ),
     "AsymmetricBlock": Call(
         rk.blocks.AsymmetricBlock,
@@ -252,14 +262,17 @@ CALLS: dict[str, Call] = {
     "CosinePulse": Call(rk.CosinePulse, CYCLE),
     "RickerPulse": Call(rk.RickerPulse, {**CYCLE, "kind": "symmetric", "center": 1.0}),
     "MavroeidisPapageorgiouPulse": Call(rk.MavroeidisPapageorgiouPulse, {**CYCLE, "oscillations": 2.0, "phase": 0.5}),
+    "HarmonicMotion": Call(rk.HarmonicMotion, {**CYCLE, "cycles": 3.0, "phase": 0.5}),
     "Record": Call(
         rk.Record, {"acceleration": [0.0, 0.1, -0.1], "dt": 0.01, "name": "a", "origin": rk.motions.Origin()}
     ),
     "Components": Call(rk.motions.Components, {"first": record(), "second": record(), "vertical": record()}),
     "Components.along": Call(rk.motions.Components(record(), record()).along, {"angle": 0.3}),
+    "on_floor": Call(rk.motions.on_floor, {"motion": pulse(), "period": 0.5, "damping": 0.05, "gain": 1.0}),
     "WithVertical": Call(rk.motions.WithVertical, {"horizontal": pulse(), "vertical": pulse()}),
     "AbstractMotion.with_vertical": Call(pulse().with_vertical, {"vertical": pulse()}),
     "AbstractMotion.shifted": Call(pulse().shifted, {"delay": 1.0}),
+    "AbstractMotion.from_time": Call(pulse().from_time, {"start": 0.3}),
     "AbstractMotion.acceleration": Call(pulse().acceleration, {"time": [0.1, 0.2]}),
     "AbstractMotion.__mul__": Call(lambda factor: pulse() * factor, {"factor": 2.0}),
     "Suite": Call(rk.motions.Suite, {"motions": [pulse()], "names": ["a"], "azimuth": None}),
@@ -312,10 +325,23 @@ CALLS: dict[str, Call] = {
     # Models and engines
     "Spring": Call(rk.Spring, {"kind": "SM1", "law": "linear"}),
     "Rolling": Call(rk.models.Rolling, {"edge": 0.2, "other": 0.1, "inertia_ratio": 0.7}),
+    "Tendon": Call(rk.models.Tendon, {"stiffness": 2.0, "prestress": 0.1}),
+    "Tendon.from_units": Call(
+        rk.models.Tendon.from_units,
+        {"stiffness": 1e5, "prestress": 1e3, "mass": 1e3, "R": 2.0, "beam": 1.0, "gravity": 9.81},
+    ),
+    "Tie": Call(rk.models.Tie, {"height": 1.2, "stiffness": 2.0, "yields": 0.1, "damping": 0.1}),
+    "Tie.from_units": Call(
+        rk.models.Tie.from_units,
+        {"height": 2.4, "stiffness": 1e5, "breaks": 1e3, "damping": 10.0, "mass": 1e3, "R": 2.0, "p": 2.0},
+    ),
+    "Damper": Call(rk.models.Damper, {"damping": 0.1, "height": 1.2}),
     "Equation": Call(
         rk.models.Equation,
         {"restoring": lambda x, block: block.alpha - x, "arm": None, "dissipation": None, "falls_flat": True},
     ),
+    "Mechanism": Call(rk.models.Mechanism, {"bodies": bodies, "moment": None, "gravity": 9.81, "falls_flat": True}),
+    "Mechanism.block": Call(rk.models.Mechanism(bodies).block, {"restitution": 0.9}),
     "Series": Call(rk.Series, {"order": 8, "tolerance": 1e-9, "max_steps": 100}),
     "Diffrax": Call(rk.Diffrax, {"rtol": 1e-8, "atol": 1e-12, "max_solves": 100, "solver": rk.Diffrax().solver}),
     # Responses
@@ -362,7 +388,10 @@ CALLS: dict[str, Call] = {
         rk.studies.self_similar_spectrum, {**RANGES, "alpha": 0.2, "restitution": 0.9, "pulse": rk.SinePulse}, True
     ),
     "overturning_map": Call(
-        rk.overturning_map, {**RANGES, "alpha": 0.2, "restitution": 0.9, "pulse": rk.SinePulse}, True, "rotation_ratio"
+        rk.overturning_map,
+        {**RANGES, "alpha": 0.2, "restitution": 0.9, "opens": None, "pulse": rk.SinePulse},
+        True,
+        "rotation_ratio",
     ),
     "similarity.groups": Call(
         rk.similarity.groups, {"block": block(), "amplitude": 0.5, "frequency": 6.0, "kind": "rigid"}
@@ -433,6 +462,42 @@ CALLS: dict[str, Call] = {
         {"found": many(), "measures": ["PGA", "IA"], "bound": "lower", "errors": "clusters"},
         True,
         ".*",
+    ),
+    "stroboscopic_map": Call(
+        rk.studies.stroboscopic_map,
+        {"block": block(), "motion": pulse(), "state": (0.01, 0.1), **QUICK, "periods": 2},
+        True,
+        "rotation|velocity",
+    ),
+    "bifurcation": Call(
+        rk.studies.bifurcation,
+        {
+            "block": block(),
+            "motion": lambda amplitude: rk.HarmonicMotion(amplitude, 1.0, 1),
+            "parameter": [0.3, 0.4],
+            "initial": (0.01, 0.1),
+            **QUICK,
+            "follow": True,
+            "transient": 2,
+            "periods": 4,
+            "progress": False,
+        },
+        True,
+        "rotation|velocity",
+    ),
+    "basins": Call(
+        rk.studies.basins,
+        {
+            "block": block(),
+            "motion": pulse(),
+            "rotation": [0.0, 0.01],
+            "velocity": [0.1],
+            **QUICK,
+            "periods": 2,
+            "progress": False,
+        },
+        True,
+        "rotation|velocity",
     ),
     "azimuth_outcomes": Call(
         rk.studies.azimuth_outcomes,
@@ -741,11 +806,13 @@ NOT_CALLED = {
     "AbstractEquation", "AbstractFragility", "AbstractMotion", "Coefficients", "Contact", "Critical", "Estimate",
     "EstimateStatus", "FeasibleRegion", "FitStatus", "FlexibleOutcome", "FlexibleResponse", "FoundRecord",
     "FragilityFit", "Grid", "HazardCurves", "HistoryFit", "HistoryStatus", "Housner", "Linear", "Outcome",
-    "OverturningMap", "Posterior", "PosteriorStatus", "RecordStatus", "Response", "Sensitivity", "SensitivityMap",
+    "OverturningMap", "Posterior", "PosteriorStatus", "RecordStatus", "Response", "RigidBody", "Sensitivity",
+    "SensitivityMap",
     "SimulatedFragility", "SimulatedSurface", "Spectrum", "Status", "SurfaceFit", "SurfaceFragility", "Terms",
     "Unexceeded", "example_record", "keep_compiled", "closed_form", "restitution", "similarity", "plot",
     "FragilityIntervals", "Slopes", "SlopeStatus", "Borders", "Region", "overturning_borders", "WeakPlane",
-    "Origin", "AzimuthOutcomes", "PulseFit", "PulseStatus", "ResponseSpectra",
+    "Origin", "AzimuthOutcomes", "PulseFit", "AbstractRestraint", "RestraintTerms", "PulseStatus", "ResponseSpectra",
+    "StroboscopicState", "Bifurcation", "Basins",
 }  # fmt: skip
 
 

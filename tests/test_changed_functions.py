@@ -358,7 +358,7 @@ def test_a_model_that_holds_an_equation():
             return False
 
     model = current_model(Stiffer(rk.models.Equation(sine)), BLOCK)
-    assert isinstance(model.inner._acceleration, TracedFunction)
+    assert isinstance(model.inner._acceleration.traced, TracedFunction)
     assert current_model(model, BLOCK) is model
     assert current_model(rk.Housner(), BLOCK) == rk.Housner()
 

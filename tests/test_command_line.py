@@ -367,8 +367,8 @@ def test_scenes_without_a_result_are_no_results(command, column, tmp_path, monke
     """Neither counted as overturned nor written; what became of them is said."""
     computed = rk.rocking_spectrum
 
-    def partly(*given):
-        result, failed = computed(*given), jnp.arange(5) < 2
+    def partly(*given, **settings):
+        result, failed = computed(*given, **settings), jnp.arange(5) < 2
         status = jax.vmap(lambda bad, kind: rk.Status.where(bad, rk.Status.undecided, kind))(failed, result.status)
         parts = status, result.overturned | failed
         return eqx.tree_at(lambda x: (x.status, x.overturned), result, parts)
@@ -387,8 +387,8 @@ def test_chaotic_scenes_are_results(command, column, tmp_path, monkeypatch):
     """Their verdicts count, and their peaks are written."""
     computed = rk.rocking_spectrum
 
-    def chaotic(*given):
-        result = computed(*given)
+    def chaotic(*given, **settings):
+        result = computed(*given, **settings)
         kinds = jax.vmap(lambda kind: rk.Status.where(True, rk.Status.chaotic, kind))(result.status)
         return eqx.tree_at(lambda x: x.status, result, kinds)
 

@@ -610,8 +610,10 @@ def test_a_sum_of_several():
 
 
 MADE_OF_MANY = {
-    "a sum of two hundred": lambda: sum(rk.SinePulse(0.1, 0.4).shifted(0.7 * k) for k in range(200)),
-    "a sum of halves": lambda: functools.reduce(lambda motion, _: motion + motion, range(8), rk.SinePulse(0.1, 0.4)),
+    "scaled sums": lambda: functools.reduce(
+        lambda m, _: 0.9 * (m + rk.SinePulse(1, 1)), range(100), rk.SinePulse(1, 1)
+    ),
+    "many records": lambda: sum(rk.Record(SAMPLES, 0.01 * k) for k in range(1, 102)).knots,
     "factors of shifts": lambda: functools.reduce(lambda m, _: 0.9 * m.shifted(0.1), range(300), rk.SinePulse(1, 1)),
     "verticals": lambda: functools.reduce(lambda m, _: m.with_vertical(RECORD), range(200), RECORD),
 }

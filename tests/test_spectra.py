@@ -10,7 +10,7 @@ import pytest
 
 import jaxrock as rk
 from jaxrock.closed_form import single_lobe
-from jaxrock.studies.spectra import of_any_size
+from jaxrock.studies.any_size import of_any_size
 
 RATIOS, INTENSITIES = np.linspace(0.4, 8.0, 23), np.linspace(1.02, 9.0, 17)
 QUICK = {"model": rk.Linear(), "engine": rk.Series(order=8), "progress": False}  # compiles in half the time

@@ -24,6 +24,11 @@ def made(kind, **fields):
     return result
 
 
+STATE = {
+    "rotation": np.zeros((2, 3)), "velocity": np.ones((2, 3)), "overturned": np.zeros((2, 3), bool),
+    "impact_count": np.ones((2, 3), np.int32), "known_periods": np.ones((2, 3), np.int32),
+    "status": jax.tree.map(lambda x: np.tile(x, (2, 1)), STATUS),
+}  # fmt: skip
 _SLOPES = made(Slopes, value=ONE, derivative=np.ones(2), elasticity=np.ones(2), reach=ONE, status=SlopeStatus.useful)
 SENSITIVITY = made(
     rk.studies.Sensitivity, names=("alpha", "p"), values=np.array([0.2, 2.5]), max_rotation=_SLOPES,
@@ -120,6 +125,15 @@ TABLES = {
     "azimuths": made(
         rk.studies.AzimuthOutcomes, azimuth=np.arange(3.0), scale=np.array([1.0, 2.0]),
         verdict=np.zeros((3, 2), np.int8), rotation_ratio=np.ones((3, 2)), margin=np.ones((3, 2)),
+    ),
+    "state": made(rk.studies.StroboscopicState, **STATE),
+    "basins": made(
+        rk.studies.Basins, rotation=np.arange(3.0), velocity=np.arange(2.0), attractor=np.ones((2, 3), np.int32),
+        orbits=(np.zeros((1, 2)),), final=made(rk.studies.StroboscopicState, **STATE),
+    ),
+    "bifurcation": made(
+        rk.studies.Bifurcation, parameter=np.arange(3.0), rotation=np.zeros((3, 4)), velocity=np.ones((3, 4)),
+        period=np.ones(3, np.int32), overturned=np.zeros(3, bool), status=STATUS,
     ),
     "fragility": made(
         rk.hazard.FragilityFit, fragility=rk.hazard.LogNormalFragility(0.3, 0.4), covariance=np.eye(2),

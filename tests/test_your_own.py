@@ -584,7 +584,7 @@ def test_speed_that_is_enough_under_the_most_helpful_forcing(restoring, arm, pus
     angles = np.linspace(opening, np.pi / 2, 200_001)
 
     def summed(terms, x):
-        constant, _, sine, cosine = (0.0 if c is None else c for c in terms.coefficients)
+        constant, _, sine, cosine, *_ = (0.0 if c is None else c for c in terms.coefficients)
         return constant + sine * np.sin(x) + cosine * np.cos(x)
 
     holds = summed(restoring, angles) + push * np.abs(summed(arm, angles))

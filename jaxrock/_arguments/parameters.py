@@ -115,6 +115,10 @@ def check_declared(owner: eqx.Module) -> None:
         if value is None or is_traced(value):
             continue
         called = known.argument or name
+        if isinstance(value, dict | eqx.Module):
+            for leaf in leaves_of(value, (called,), known):
+                leaf.declared.range(leaf.name, leaf.value)
+            continue
         known.range(called, value)
         if isinstance(value, (list, tuple)):
             raise ValueError(f"Argument `{called}` must be a number or an array, as of `numpy.asarray`, but is a list.")
@@ -149,13 +153,17 @@ class Leaf(NamedTuple):
     @property
     def is_number(self) -> bool:
         """Return whether it is one number of a scene that derivatives may be taken by."""
-        one = self.declared.axes == 0 or (self.declared.axes is None and jnp.ndim(self.value) == 0)
+        one = self.declared.axes == 0 or jnp.ndim(self.value) == 0
         free = self.declared.is_free and not self.declared.is_whole
         return one and free and jnp.issubdtype(jnp.result_type(self.value), jnp.inexact)
 
 
 def leaves_of(owner: Any, path: tuple[str, ...] = (), known: Parameter = _UNDECLARED) -> Iterator[Leaf]:
-    """Yield all leaves of a tree, in the order of `jax.tree.leaves`."""
+    """Yield all leaves of a tree, in the order of `jax.tree.leaves`.
+
+    A module that has a method `parameter_path` names what it holds. The method takes the path of fields to a leaf,
+    within the module, and returns the path in its name; or None for a leaf that is no parameter.
+    """
     if not isinstance(owner, eqx.Module):
         for keys, value in jax.tree_util.tree_leaves_with_path(owner, is_leaf=_is_module):
             inner = (*path, *(jax.tree_util.keystr((key,), simple=True) for key in keys))
@@ -167,7 +175,22 @@ def leaves_of(owner: Any, path: tuple[str, ...] = (), known: Parameter = _UNDECL
     for field in dataclasses.fields(owner):
         if not field.metadata.get("static", False):
             own = field.metadata.get("parameter", _UNDECLARED)
-            yield from leaves_of(getattr(owner, field.name), (*path, field.name), own)
+            held = leaves_of(getattr(owner, field.name), (field.name,), own)
+            yield from (leaf._replace(path=(*path, *leaf.path)) for leaf in _renamed(owner, held))
+
+
+def _renamed(owner: eqx.Module, leaves: Iterator[Leaf]) -> Iterator[Leaf]:
+    """Yield leaves with the names that their owner gives them; those without a name are no parameters."""
+    named = getattr(owner, "parameter_path", None)
+    if named is None:
+        yield from leaves
+        return
+    for leaf in leaves:
+        told = named(leaf.path)
+        if told is None:
+            yield leaf._replace(declared=leaf.declared._replace(is_free=False))
+        else:
+            yield leaf._replace(path=tuple(told))
 
 
 def with_values(owner: Any, values: Mapping[str, Any]) -> Any:

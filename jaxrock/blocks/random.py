@@ -3,6 +3,7 @@
 import functools
 from typing import Annotated, Any, overload
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -82,9 +83,9 @@ class _NoBlock(ValueError):
     """A draw is outside of its range."""
 
 
-def _made(kind: type, *parameters) -> Any:
+def _made(kind: type, *parameters, **settings) -> Any:
     try:
-        return kind(*parameters)
+        return kind(*parameters, **settings)
     except ValueError as error:
         raise _NoBlock(str(error)) from None
 
@@ -100,7 +101,11 @@ def _drawn(block: Block, alpha: Array, p: Array, restitution: float, key: Array)
     else:
         ends = (0 - block.restitution) / restitution, (1 - block.restitution) / restitution
         law = block.restitution + restitution * jax.random.truncated_normal(key, *ends, alpha.shape)
-    return _made(Block, alpha * block.alpha, p * block.p, law)
+    made = _made(Block, alpha * block.alpha, p * block.p, law, opens=block.opens)
+    if block.beam is None:
+        return made
+    beams = jnp.broadcast_to(block.beam, alpha.shape)
+    return eqx.tree_at(lambda frame: frame.beam, made, beams, is_leaf=lambda x: x is None)
 
 
 def _drawn_sides(block: AsymmetricBlock, alpha: Array, p: Array, restitution: float) -> AsymmetricBlock:

@@ -40,7 +40,8 @@ def _run(arguments: argparse.Namespace, report: Report) -> None:
     narrowest = None if arguments.narrowest is None else known(not_negative)("narrowest", arguments.narrowest)
     _check_range(arguments.range)
     record, model = record_of(arguments), model_of(arguments)
-    block = rk.Block.from_dimensions(arguments.width, arguments.height, arguments.restitution)
+    width, height = arguments.width, arguments.height
+    block = rk.Block.from_dimensions(width, height, arguments.restitution, opens=arguments.opens)
     peak, threshold = float(rk.intensity.peak_acceleration(record)), float(model.moments(block).threshold)
     if not peak > 0:
         raise ValueError(f"The record must move the ground, but its peak is {peak:g} g.")
@@ -51,8 +52,8 @@ def _run(arguments: argparse.Namespace, report: Report) -> None:
     found = rk.critical_amplitudes(block, record, model, intensity=intensity, derivatives=False)
     ends = found if narrowest is None else found.without_thin(narrowest)
     report.title(record.name or "unnamed record")
-    size = Entry("width_and_height", "block, width x height", (arguments.width, arguments.height), unit="m",
-                 shown=f"{arguments.width:g} x {arguments.height:g}")  # fmt: skip
+    size = Entry("width_and_height", "block, width x height", (width, height), unit="m",
+                 shown=f"{width:g} x {height:g}")  # fmt: skip
     report.table([size, *_entries(ends, peak, threshold, searched)])
     _tell(report, "intervals", "overturns", _rows(ends, intervals_of(ends), peak), searched)
     if narrowest is not None:

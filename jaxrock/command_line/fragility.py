@@ -50,7 +50,8 @@ def _run(arguments: argparse.Namespace, report: Report) -> None:
     suite = rk.motions.Suite(
         [rk.read_record(path, **file_description(arguments)) for path in files_of(arguments.records)]
     )
-    block = rk.Block.from_dimensions(arguments.width, arguments.height, arguments.restitution)
+    size = arguments.width, arguments.height
+    block = rk.Block.from_dimensions(*size, arguments.restitution, opens=arguments.opens)
     if arguments.scatter != 0:
         block = rk.blocks.draw_blocks(block, arguments.draws, alpha=arguments.scatter)
     levels = np.geomspace(*arguments.levels, arguments.points)

@@ -50,6 +50,7 @@ def _run(arguments: argparse.Namespace, report: Report) -> None:
         **axes,
         alpha=arguments.alpha,
         restitution=arguments.restitution,
+        opens=arguments.opens,
         pulse=pulse_of(arguments),
         model=model_of(arguments),
     )

@@ -37,10 +37,12 @@ def model_of(arguments: argparse.Namespace) -> rk.models.AbstractEquation:
 
 
 def add_restitution(parser: argparse.ArgumentParser) -> None:
-    """Add the option of the block's restitution."""
+    """Add the options of the block's impacts: its restitution, and the side to which a wall opens."""
     parser.add_argument(
         "--restitution", type=plain_float, help="angular velocity after/before impact (default: Housner's)"
     )
+    words = "side to which a wall opens, as something stands behind it; it needs a restitution (default: to both)"
+    parser.add_argument("--opens", choices=("right", "left"), help=words)
 
 
 def add_record(parser: argparse.ArgumentParser) -> None:

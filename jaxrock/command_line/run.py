@@ -36,12 +36,13 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
 
 def _run(arguments: argparse.Namespace, report: Report) -> None:
     record, model = record_of(arguments), model_of(arguments)
-    block = rk.Block.from_dimensions(arguments.width, arguments.height, arguments.restitution)
+    width, height = arguments.width, arguments.height
+    block = rk.Block.from_dimensions(width, height, arguments.restitution, opens=arguments.opens)
     response = rk.simulate(block, record, model, duration=arguments.duration)
     result = rk.outcome(block, record, model)
     report.title(record.name or "unnamed record")
-    size = Entry("width_and_height", "block, width x height", (arguments.width, arguments.height), unit="m",
-                 shown=f"{arguments.width:g} x {arguments.height:g}")  # fmt: skip
+    size = Entry("width_and_height", "block, width x height", (width, height), unit="m",
+                 shown=f"{width:g} x {height:g}")  # fmt: skip
     report.table(_entries(size, block, record, model, result, response))
     _write(report, arguments.out, response)
     if arguments.animate:

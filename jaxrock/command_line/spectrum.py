@@ -43,7 +43,9 @@ def _run(arguments: argparse.Namespace, report: Report) -> None:
     motion = scaled_record(next(iter(files), None), arguments) if len(files) < 2 else _suite(files, arguments, report)
     period = np.linspace(arguments.shortest, arguments.longest, arguments.points)
     alpha = np.arctan(1 / arguments.slenderness)
-    result = rk.rocking_spectrum(alpha, motion, period, arguments.restitution, model_of(arguments))
+    result = rk.rocking_spectrum(
+        alpha, motion, period, arguments.restitution, model_of(arguments), opens=arguments.opens
+    )
     known = ~np.asarray(result.is_open)
     lost = np.asarray(result.overturned) & known
     entries = [

@@ -2,11 +2,12 @@
 
 from dataclasses import replace
 
+import jax
 import jax.numpy as jnp
 
 from jaxrock._core.types import Flag, Scalar
 from jaxrock.compiler.hints import materialize, select, stop_gradient
-from jaxrock.engines.state import State, surpasses
+from jaxrock.engines.state import Counts, State, surpasses
 from jaxrock.engines.stepper import AbstractStepper
 from jaxrock.engines.uncertainty import GRAZING, StateCovariance
 from jaxrock.models.equation import Angle
@@ -29,6 +30,9 @@ def checked_step(stepper: AbstractStepper, before: State, after: State) -> State
         # In the free stage only the next peak or passage counts, which `record_extrema` judges.
         lost = lost & (before.piece < stepper.scene.pieces)
     undecided = lost & (after.status == Status.successful)
+    if after.counts is not None:  # impacts of the free stage count only if the block overturns after them
+        moving, now = before.piece < stepper.scene.pieces, Counts(after.impacts, after.large_impacts)
+        after = replace(after, counts=jax.tree.map(lambda a, b: select(moving, a, b), now, before.counts))
     status = Status.where(undecided, Status.undecided, after.status)
     return replace(
         after,
@@ -89,8 +93,8 @@ def record_extrema(
     moments = stepper.scene.moments
     # Take the larger acceleration, with or without the shaking. A block that the ground holds for an instant, far from
     # its saddle, is not in balance.
-    pull = jnp.maximum(jnp.abs(acceleration), jnp.abs(moments.restoring(Angle.of(opening))))
-    per_rest = 1 / moments.restoring_at_rest**2  # `keep` below has XLA compute the product once
+    pull = jnp.maximum(jnp.abs(acceleration), jnp.abs(moments.fall(Angle.of(opening))))
+    per_rest = 1 / moments.fall_at_rest**2  # `keep` below has XLA compute the product once
     stillness = materialize((moments.stiffness * speed**2 + pull**2) * per_rest, state.local)
     turn = turning & (outward | state.beyond)
     closeness = select(turn, jnp.minimum(state.closeness, stillness), state.closeness)

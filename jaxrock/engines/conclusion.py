@@ -49,6 +49,9 @@ def conclude(stepper: AbstractStepper, state: State) -> Conclusion:
     """Add the free stage to a state at the end of the motion (or where the block was lost)."""
     final = stepper.finish(state)
     overturned = final.overturned
+    impacts = final.impacts, final.large_impacts
+    if final.counts is not None:
+        impacts = tuple(select(overturned, whole, own) for whole, own in zip(impacts, final.counts))
 
     def unless_overturned(value):
         return select(overturned, jnp.inf, value)
@@ -64,8 +67,8 @@ def conclude(stepper: AbstractStepper, state: State) -> Conclusion:
         max_rotation=unless_overturned(final.peak),
         max_velocity=unless_overturned(final.fastest * stepper.scene.p),
         time_of_max=unless_overturned(final.peak_time),
-        impact_count=final.impacts,
-        large_impact_count=final.large_impacts,
+        impact_count=impacts[0],
+        large_impact_count=impacts[1],
         overturned=overturned,
         overturned_share=_share(status, overturned, margin.dtype),
         margin=margin,

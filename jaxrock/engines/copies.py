@@ -24,7 +24,7 @@ from jaxrock.compiler import cond_any
 from jaxrock.compiler.hints import select, stop_gradient
 from jaxrock.engines.bookkeeping import MOST_OFF
 from jaxrock.engines.conclusion import Conclusion, conclude
-from jaxrock.engines.state import State
+from jaxrock.engines.state import Reached, State
 from jaxrock.engines.stepper import AbstractStepper
 from jaxrock.engines.uncertainty import StateCovariance
 from jaxrock.status import Status
@@ -52,7 +52,7 @@ _DRAWS = _normal_pairs(MORE + SKIPPED + 1)
 
 def scattered(stepper: AbstractStepper, state: Any, number: Int[Array, ""]) -> tuple[Scalar, Scalar, Flag]:
     """Draw opening and velocity from the covariance of a state; return them, and whether it is beyond the saddle."""
-    scene, spread = stepper.on(state.side).scene, state.spread
+    scene, spread = stepper.at(state).scene, state.spread
     first, second = (jnp.asarray(draws, state.opening.dtype)[number % draws.size] for draws in _DRAWS)
     # At least some units of rounding, else all copies would be the same motion.
     least = 64 * jnp.finfo(state.opening.dtype).eps * scene.alpha
@@ -76,11 +76,12 @@ class Branch(eqx.Module):
     fastest: Scalar
     closeness: Scalar
     spread: StateCovariance
+    reached: Reached | None  # by ties that remember it
 
     @classmethod
     def of(cls, state: State) -> "Branch":
         """Keep the fields of a state, without derivatives."""
-        names = ("piece", "local", "side", "opening", "velocity", "peak", "fastest", "closeness", "spread")
+        names = "piece", "local", "side", "opening", "velocity", "peak", "fastest", "closeness", "spread", "reached"
         return stop_gradient(cls(*(getattr(state, name) for name in names)))
 
     def copy(self, stepper: AbstractStepper, like: State, number: Int[Array, ""]) -> State:
@@ -103,6 +104,7 @@ class Branch(eqx.Module):
             closeness=jnp.maximum(self.closeness, _FAR),
             closeness_beyond=jnp.full_like(opening, jnp.inf),
             spread=StateCovariance.none(zero),
+            reached=self.reached,
             overturned=no,
             done=(self.piece >= stepper.scene.pieces) & (not stepper.follows_free_stage),
             status=Status.where(no, Status.undecided, Status.successful),
@@ -302,30 +304,20 @@ def conclude_with_copies(stepper: AbstractStepper, state: State) -> Conclusion:
     """
     if not stepper.has_copies:
         return conclude(stepper, stepper.to_the_end(state))
-    budget, pieces = stepper.engine.budget(stepper.scene, history=False), stepper.scene.pieces
+    budget = stepper.engine.budget(stepper.scene, history=False)
 
     def step(carry):
-        state, paths, counted = carry
+        state, paths = carry
         over = paths.is_over(state, budget)
         after = stepper.advance(state)
         paths = _either(over, paths, paths.noted(stepper, state, after))
         after = paths.parted(stepper, after)
-        counted = _either(over | (state.piece >= pieces), counted, _counts(after)) if counted else None
-        ends = _either(over, state, after), paths, counted
 
         def next_path(carry, needed, inside):
-            state, paths, counted = jax.tree.map(inside, carry)
-            ended = conclude(stepper, state)
-            if counted:  # impacts of the free stage count only if the block overturns after them
-                impacts, large = _either(ended.overturned, _counts(state), counted)
-                ended = replace(ended, impact_count=impacts, large_impact_count=large)
-            return *paths.next(stepper, state, ended), counted
+            state, paths = jax.tree.map(inside, carry)
+            return paths.next(stepper, state, conclude(stepper, state))
 
-        return cond_any(over, next_path, ends)
+        return cond_any(over, next_path, (_either(over, state, after), paths))
 
-    carry = state, Paths.of(state), _counts(state) if stepper.follows_free_stage else None
+    carry = stepper.begun(state), Paths.of(state)
     return stepper.engine.loop(lambda carry: ~carry[1].finished, step, carry, most_paths(budget))[1].base
-
-
-def _counts(state: State) -> tuple:
-    return state.impacts, state.large_impacts

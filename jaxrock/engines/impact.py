@@ -1,5 +1,7 @@
 """The impact: the one place where a block's state is reset, by its law of restitution.
 
+The block goes on to its other side; a wall that opens to one side goes on to the same side again.
+
 After an impact at speed v the block hops for 2 v/a, where a is the deceleration on that side. All hops to come last 2 v
 (1/a + e'/a')/(1 - e e'), with a' and e' on the other side.
 
@@ -7,7 +9,8 @@ They are replaced by rest on two conditions:
 
 - They certainly end before the forcing has changed by half of the weaker deceleration. Then all speeds stay below
   e^(1/2) those of constant forcing, and all hops end within four times that time.
-- No hop is higher, faster or closer to overturning than the block has been.
+- No hop is higher, faster or closer to overturning than the block has been. Beside ties with a memory, hops of rounding
+  height may be closer.
 
 Each hop is slower by e, so those above the rounding of alpha can be counted.
 """
@@ -39,7 +42,7 @@ class _Rest(NamedTuple):
 
 
 class _Rebound(NamedTuple):
-    """A block that has just come down on its other side."""
+    """A block just after an impact, on its other side; a wall that opens to one side stays on it."""
 
     speed: Scalar  # outward, after the impact
     here: Scalar  # decelerations on its side,
@@ -50,7 +53,7 @@ class _Rebound(NamedTuple):
 def impact(
     stepper: AbstractStepper, state: State, hit: Flag, speed: Scalar, ground: tuple, steepest: tuple, reach: Scalar
 ) -> State:
-    """Change side with the restitution; come to rest where the impacts to come no longer matter.
+    """Go on after an impact, with the restitution; come to rest where the impacts to come no longer matter.
 
     `ground`: acceleration [g] and weight (`Shaking.at`). Within `reach` seconds from now the horizontal and vertical
     acceleration change by `steepest` [g/s] at most.
@@ -71,7 +74,7 @@ def impact(
         large_impacts=state.large_impacts + (hit & (speed < -least)) + large,
         impact_time=select(hit, stepper.time(state), state.impact_time),
         impact_velocity=select(hit, state.side * speed, state.impact_velocity),
-        side=select(rests, 0.0, select(hit, -state.side, state.side)),
+        side=select(rests, 0.0, select(hit, stepper.scene.next_side(state.side), state.side)),
         clearance=select(slowed, jnp.minimum(state.clearance, depth), state.clearance),
         fastest=fastest,
         opening=select(hit, 0.0, state.opening),
@@ -88,7 +91,7 @@ def impact(
 
 def _rebound(stepper: AbstractStepper, state: State, speed: Scalar, ground: tuple) -> _Rebound:
     """Compute the state just after an impact at `speed` < 0."""
-    scene, (moments, ahead), side = stepper.scene, stepper.scene.both_moments, -state.side
+    scene, (moments, ahead), side = stepper.scene, stepper.scene.both_moments, stepper.scene.next_side(state.side)
     before = jnp.abs(speed)
     ratio = scene.reset.ratio(before)
     rebound, rest = ratio * before, Angle(jnp.zeros_like(speed), 0.0, 1.0)
@@ -129,7 +132,7 @@ def _rests(
     dies = held & (change * window <= weaker / 2) & (window <= reach)
     # Speed of a hop of rounding height; a history shows the hops down to that speed.
     low = jnp.sqrt(100 * jnp.finfo(scene.p.dtype).eps * scene.alpha * jnp.minimum(here, there))
-    if stepper.history or scene.reset.depends_on_speed:  # later ratios are unknown
+    if stepper.history or scene.reset.depends_on_speed or scene.moments.is_damped:  # later speeds are unknown
         dies = dies & (rebound <= low)
     if not stepper.history:
         highest = 3 * rebound**2 * jnp.maximum(1 / here, back * back / there)
@@ -137,7 +140,10 @@ def _rests(
         dies = dies & (highest <= state.peak) & (fastest <= state.fastest)
         for moments in scene.different_moments:
             top = Angle.of(jnp.minimum(highest, moments.saddle))
-            dies = dies & ((moments.restoring(top) / moments.restoring_at_rest) ** 2 >= state.closeness)
+            far_from_balance = (moments.fall(top) / moments.fall_at_rest) ** 2 >= state.closeness
+            if moments.remembers:  # where a tie has broken, a block at rest may be closer to balance than ever before
+                far_from_balance = far_from_balance | (rebound <= low)
+            dies = dies & far_from_balance
     rests = materialize_flag(hit & (dies | (rebound == 0)), state.local)
     slower = e if scene.far is None else jnp.sqrt(e * back)  # mean ratio of speeds from hop to hop
     per_impact = logarithm(jnp.clip(slower, 1e-3, 1 - 1e-9))

@@ -1,5 +1,7 @@
 """Bounds of the forcing still to come, from each piece of a motion on."""
 
+from dataclasses import replace
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -33,6 +35,11 @@ class _Ahead(eqx.Module):
         to_end, near, far = _maxima(values)
         return cls(bounds, to_end if bounds.left is None else _maximum_to_end(values, bounds.left), near, far)
 
+    @property
+    def repeated(self) -> "_Ahead":
+        """The bounds of a motion that repeats: the largest of all is always to come."""
+        return replace(self, to_end=jnp.full_like(self.to_end, jnp.max(self.to_end)))
+
     def at(self, values: Inexact[Array, " knots"], piece: Int[Array, ""]) -> Scalar:
         """Look up one of these arrays at a piece, times the gain."""
         return self.bounds.times_gain(take(values, piece))
@@ -40,17 +47,25 @@ class _Ahead(eqx.Module):
 
 class RemainingForcing(eqx.Module):
     """Bounds of each component of the forcing still to come, and whether it lifts a block that rests while |u| <
-    threshold (1 + v)."""
+    threshold + of_weight v."""
 
     horizontal: _Ahead
     vertical: _Ahead | None
     threshold: Scalar
+    of_weight: Scalar  # the part of the threshold that changes with a vertical acceleration
 
     @classmethod
-    def of(cls, envelope: Envelope, threshold: Scalar) -> "RemainingForcing":
-        """Build the outlook of a motion."""
+    def of(cls, envelope: Envelope, threshold: Scalar, of_weight: Scalar | None = None) -> "RemainingForcing":
+        """Build the outlook of a motion; `of_weight`: None where the weight makes all of the threshold."""
         vertical = None if envelope.vertical is None else _Ahead.of(envelope.vertical)
-        return cls(_Ahead.of(envelope.horizontal), vertical, threshold)
+        of_weight = threshold if of_weight is None else of_weight
+        return cls(_Ahead.of(envelope.horizontal), vertical, threshold, of_weight)
+
+    @property
+    def repeated(self) -> "RemainingForcing":
+        """The outlook of a motion that repeats."""
+        vertical = None if self.vertical is None else self.vertical.repeated
+        return replace(self, horizontal=self.horizontal.repeated, vertical=vertical)
 
     @property
     def strongest_drive(self) -> Scalar:
@@ -59,16 +74,16 @@ class RemainingForcing(eqx.Module):
         if self.vertical is None:
             return horizontal.strongest
         vertical = self.vertical.bounds
-        weight = self.threshold * vertical.times_gain(vertical.values)
+        weight = self.of_weight * vertical.times_gain(vertical.values)
         return jnp.max(horizontal.times_gain(horizontal.values) + weight)
 
     def _drive(self, piece: Int[Array, ""], which: str) -> Scalar:
-        """Return a bound of the drive against the threshold [g]; a block stays at rest while |u| + threshold |v| <
+        """Return a bound of the drive against the threshold [g]; a block stays at rest while |u| + of_weight |v| <
         threshold."""
         drive = self.horizontal.at(getattr(self.horizontal, which), piece)
         if self.vertical is None:
             return drive
-        return drive + self.threshold * self.vertical.at(getattr(self.vertical, which), piece)
+        return drive + self.of_weight * self.vertical.at(getattr(self.vertical, which), piece)
 
     def is_over(self, piece: Int[Array, ""]) -> Bool[Array, ""]:
         """Return whether no forcing from a piece on lifts a block at rest."""

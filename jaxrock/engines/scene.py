@@ -16,10 +16,12 @@ from jaxrock.blocks.rigid import Block
 from jaxrock.compiler import checks
 from jaxrock.compiler.hints import select
 from jaxrock.engines.remaining_forcing import RemainingForcing
-from jaxrock.models.coefficients import Coefficients
+from jaxrock.models.coefficients import of_one_kind
 from jaxrock.models.equation import AbstractEquation, AbstractMoments
+from jaxrock.motions.floors import with_solved_floors
+from jaxrock.motions.harmonic import cycles_in
 from jaxrock.motions.joined_records import in_place as found_in_place, is_in_place
-from jaxrock.motions.motion import AbstractMotion, is_of_several
+from jaxrock.motions.motion import AbstractMotion, is_of_several, merged_pieces
 from jaxrock.motions.shaking import Shaking, sum_of_series
 from jaxrock.numerics.lookup import take
 
@@ -43,9 +45,9 @@ def _moments(block: Block | AsymmetricBlock, model: AbstractEquation) -> tuple:
 def _made(block: Block | AsymmetricBlock, model: AbstractEquation) -> tuple:
     if isinstance(block, Block):
         moments = model.moments(block)
-        return moments.balanced if isinstance(moments, Coefficients) else moments, None
+        return moments.balanced, None
     both = zip(model.moments_of_sides(block), block.sides)
-    return tuple(moments.times((side.p / block.p1) ** 2) for moments, side in both)
+    return of_one_kind(*(moments.times((side.p / block.p1) ** 2) for moments, side in both))
 
 
 def _least_threshold(moments: AbstractMoments, far: AbstractMoments | None) -> Scalar:
@@ -56,6 +58,12 @@ def _endless(values: Inexact[Array, " pieces"], count: Int[Array, ""] | None) ->
     """Append infinity for the quiet after the last piece; pieces past `count` are infinite, too."""
     values = jnp.concatenate([values, jnp.full(1, jnp.inf, values.dtype)])
     return values if count is None else select(jnp.arange(values.size) < count, values, jnp.inf)
+
+
+def _ties(knots: Inexact[Array, " knots"]) -> Int[Array, " knots"]:
+    """Return, for each knot, the number of the first one that coincides with it."""
+    numbers = jnp.arange(knots.size, dtype=jnp.int32)
+    return jax.lax.cummax(select(jnp.diff(knots, prepend=-jnp.inf) > 0, numbers, 0))
 
 
 def uplift_threshold(block: Block | AsymmetricBlock, model: AbstractEquation) -> Scalar:
@@ -94,7 +102,13 @@ class Scene(eqx.Module):
     falls_flat: bool = eqx.field(static=True)
     first: Int[Array, ""] | None = None  # first piece, where the array joins many motions; None: 0
     room: int | None = eqx.field(static=True, default=None)  # most pieces of one of these motions
+    merged: int = eqx.field(static=True, default=0)  # pieces of sums of many parts beyond those of their longest part
+    ties: Int[Array, " knots"] | None = None  # for each knot of a sum of many, the first that coincides with it
+    cycles: Scalar | None = None  # of harmonic parts of the motion; None: it has none
     here: Here | None = None  # None: the whole motion is known
+    only_side: int | None = eqx.field(static=True, default=None)  # of a wall that opens to one side; None: both
+    forces_follow: bool = eqx.field(static=True, default=False)  # whether those of the ground are known (`contact`)
+    is_frame: bool = eqx.field(static=True, default=False)
 
     @classmethod
     def of(
@@ -109,7 +123,7 @@ class Scene(eqx.Module):
         dtype = jnp.result_type(*jax.tree.leaves((block, motion)))
         block, motion = in_precision(block, dtype), in_precision(motion, dtype)
         stretch = found_in_place(motion) if in_place and is_in_place(motion) else None
-        motion = motion if stretch is None else stretch.motion
+        motion = with_solved_floors(motion).prepared if stretch is None else stretch.motion
         knots, envelope = motion.knots, motion.envelope
         if stretch is not None:
             count = stretch.end
@@ -122,10 +136,12 @@ class Scene(eqx.Module):
             )
         moments, far = _moments(block, model)
         if isinstance(block, Block):
-            p, alpha, corners = block.p, block.alpha, on_sides(block.law, block.corners)
+            p, alpha, only_side = block.p, block.alpha, block.only_side
+            corners = on_sides(block.law, block.corners) if only_side is None else (block.corners,) * 2
             far = None if corners[0] is corners[1] else moments
         else:
             p, alpha, corners = block.p1, jnp.minimum(block.alpha1, block.alpha2), block.corners
+            only_side = None
         most = 1.0 if isinstance(block, Block) else jnp.inf
         reset, far_reset = (Reset.of(block.law, each, p, most) for each in corners)
         return cls(
@@ -140,16 +156,30 @@ class Scene(eqx.Module):
             scales=None if motion.scales is None else _endless(motion.scales, None if stretch else count),
             count=count,
             following=motion.following,
-            outlook=RemainingForcing.of(envelope, _least_threshold(moments, far)),
+            outlook=RemainingForcing.of(envelope, _least_threshold(moments, far), moments.threshold_of_weight),
             falls_flat=model.falls_flat,
+            forces_follow=model.forces_follow,
+            is_frame=isinstance(block, Block) and block.beam is not None,
             first=None if stretch is None else stretch.first,
             room=None if stretch is None else stretch.room,
+            only_side=only_side,
+            merged=merged_pieces(motion),
+            ties=_ties(knots) if merged_pieces(motion) else None,
+            cycles=cycles_in(motion),
         )
 
     @property
     def most_pieces(self) -> int:
         """Return the largest number of pieces, from static shapes."""
         return self.knots.size - 1 if self.room is None else self.room
+
+    @property
+    def pieces_of_part(self) -> int:
+        """Return the largest number of pieces, in which a sum of many parts counts as its longest part.
+
+        Steps under many pulses are as long as under one. Pieces of records are shorter than steps.
+        """
+        return self.most_pieces - self.merged
 
     @property
     def pieces(self) -> Int[ArrayLike, ""]:
@@ -172,6 +202,10 @@ class Scene(eqx.Module):
             far_reset=of(self.far_reset, self.reset),
         )
 
+    def next_side(self, side: Scalar) -> Scalar:
+        """Return the side on which a block stands after an impact: a wall rebounds to its only one."""
+        return -side if self.only_side is None else side
+
     @property
     def both_moments(self) -> tuple[AbstractMoments, AbstractMoments]:
         """Return the moments of this side and of the other."""
@@ -190,13 +224,17 @@ class Scene(eqx.Module):
     def drives_of(self, shaking: Shaking) -> list[tuple[list[Scalar], Scalar]]:
         """Return, for uplift to side 1 and to side -1, the drive as a series and the level that it must exceed.
 
-        The block uplifts to side s where -s u > threshold (1 + v).
+        The block uplifts to side s where -s u > threshold + own v, own the part of the threshold that the weight holds.
+        No drive lifts a wall to the side that is held.
         """
         found = []
         for side, moments in zip((1, -1), self.both_moments):
             drive = [-side * u for u in shaking.horizontal]
             if shaking.vertical is not None:
-                drive = sum_of_series(drive, [-moments.threshold * v for v in shaking.vertical])
+                own = moments.threshold if moments.threshold_of_weight is None else moments.threshold_of_weight
+                drive = sum_of_series(drive, [-own * v for v in shaking.vertical])
+            if self.only_side not in (None, side):
+                drive = [jnp.zeros_like(c) for c in drive]
             found.append((drive, moments.threshold))
         return found
 
@@ -205,7 +243,8 @@ class Scene(eqx.Module):
         early."""
         later = self.outlook.after_quiet(piece)
         if is_of_several(self.motion):  # zero-length pieces just before may carry derivatives
-            later = jnp.maximum(later - _TOGETHER, piece)
+            back = later - _TOGETHER if self.ties is None else self.ties[jnp.minimum(later, self.most_pieces)]
+            later = jnp.maximum(back, piece)
         return jnp.minimum(later, self.pieces)
 
     def from_here(self, piece: Int[Array, ""]) -> Int[Array, ""]:

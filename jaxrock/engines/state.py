@@ -1,6 +1,7 @@
 """The state of a lane: one block under one motion at one time."""
 
 from dataclasses import fields, replace
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -15,6 +16,29 @@ from jaxrock.engines.uncertainty import StateCovariance
 from jaxrock.models.equation import Angle
 from jaxrock.numerics.derivatives_of import with_derivatives_of
 from jaxrock.status import Status
+
+
+class Counts(NamedTuple):
+    """Impacts up to the end of the motion, where steps follow the free stage, too."""
+
+    impacts: Int[Array, "..."]
+    large: Int[Array, "..."]
+
+
+class Reached(NamedTuple):
+    """Largest opening angle so far on either side [rad], which ties remember."""
+
+    right: Scalar
+    left: Scalar
+
+    def on(self, side: Scalar) -> Scalar:
+        """Return the value on a side."""
+        return select(side < 0, self.left, self.right)
+
+    def with_opening(self, side: Scalar, opening: Scalar) -> "Reached":
+        """Return the values after an opening angle on a side."""
+        right, left = (select(opening > known, opening, known) for known in self)
+        return Reached(select(side > 0, right, self.right), select(side < 0, left, self.left))
 
 
 class State(eqx.Module):
@@ -47,6 +71,8 @@ class State(eqx.Module):
     done: Flag
     status: Status
     steps: Int[Array, ""]
+    counts: Counts | None = None  # None: steps do not follow the free stage
+    reached: Reached | None = None  # None: the moments have no memory
 
 
 class Node(eqx.Module):
@@ -59,6 +85,7 @@ class Node(eqx.Module):
     velocity: Inexact[Array, "..."]
     uplifting: Bool[Array, "..."]
     done: Bool[Array, "..."]
+    reached: Reached | None = None
 
     @classmethod
     def of(cls, state: "State | Node") -> "Node":
@@ -106,11 +133,14 @@ def initial_state(scene: Scene, rotation: Scalar, velocity: Scalar) -> State:
     outward = with_derivatives_of(side * velocity, select(side < 0, -velocity, velocity))
     zero, no = jnp.zeros_like(opening), jnp.zeros_like(opening, bool)
     count = jnp.zeros_like(opening, jnp.int32)
-    moments = scene.on(side).moments
+    moments: Any = scene.on(side).moments
+    reached = None
+    if moments.remembers:
+        moments, reached = moments.remembering(opening), Reached(zero, zero).with_opening(side, opening)
     beyond = opening >= moments.saddle
     # Squared distance from standing still in balance, for a block that starts past its saddle.
-    pull = moments.restoring(Angle.of(opening))
-    stillness = (moments.stiffness * outward**2 + pull**2) / moments.restoring_at_rest**2
+    pull = moments.fall(Angle.of(opening))
+    stillness = (moments.stiffness * outward**2 + pull**2) / moments.fall_at_rest**2
     # For a block that the motion cannot lift, the margin is the distance of the motion from lifting it.
     unlifted = jnp.maximum(2 - scene.outlook.strongest_drive / scene.threshold, 1)
     eps = jnp.finfo(opening.dtype).eps
@@ -122,6 +152,8 @@ def initial_state(scene: Scene, rotation: Scalar, velocity: Scalar) -> State:
     forward = scene.motion.lasting.forward if scene.first is None else scene.motion.length(scene.first) >= 0
     forward = forward & (scene.knots[0] >= 0) & (scene.knots[-1] >= 0)
     finite = finite & (scene.threshold > 0) & (scene.p > 0) & forward
+    if scene.only_side is not None:  # what stands behind a wall leaves it no room there
+        finite = finite & (side != -scene.only_side)
     spread = StateCovariance.none(opening).plus(eps * opening, eps * outward)
     if scene.motion.time_rounding is not None:  # a push that comes too late: at first the velocity lacks its impulse
         spread = spread.plus(0.0, scene.outlook.strongest_drive * scene.p * scene.motion.time_rounding)
@@ -152,6 +184,7 @@ def initial_state(scene: Scene, rotation: Scalar, velocity: Scalar) -> State:
         done=~finite,
         status=Status.where(finite, Status.successful, Status.not_finite),
         steps=count,
+        reached=reached,
     )
 
 

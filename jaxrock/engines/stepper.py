@@ -7,7 +7,7 @@ and `evaluate`, which reads a history. The steps that all engines share are in `
 import abc
 from collections.abc import Callable
 from dataclasses import replace
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -17,7 +17,7 @@ from jaxtyping import Array, Int, PyTree
 from jaxrock._core.types import Flag, Scalar
 from jaxrock.compiler.hints import select
 from jaxrock.engines.scene import Scene
-from jaxrock.engines.state import Node, State
+from jaxrock.engines.state import Counts, Node, State
 
 FEW_PIECES = 32  # up to which a motion is over before chaos grows
 Stepper = TypeVar("Stepper", bound="AbstractStepper")
@@ -83,8 +83,15 @@ class AbstractStepper(eqx.Module):
     def advance(self, state: State) -> State:
         """Return the state at the next event or step."""
 
+    def begun(self, state: State) -> State:
+        """Return a state at time 0, or at the end of the motion, from which `advance` follows a block."""
+        if not self.follows_free_stage:
+            return state
+        return replace(state, counts=Counts(state.impacts, state.large_impacts))
+
     def to_the_end(self, state: State) -> State:
         """Advance a state at time 0 to the end of the motion, or until the block is lost."""
+        state = self.begun(state)
         budget = self.engine.budget(self.scene, history=False)
         return self.engine.loop(lambda s: ~s.done & (s.steps < budget), lambda s: self.advance(s), state, budget)
 
@@ -95,8 +102,15 @@ class AbstractStepper(eqx.Module):
 
     @property
     def follows_free_stage(self) -> bool:
-        """Return whether steps follow the free stage, too, unless for a history."""
+        """Return whether steps follow the free stage, too."""
         return False
+
+    def after_history(self, state: State) -> State:
+        """Follow the free stage by steps from the last state of a history."""
+        stepper: Any = replace(self, stop=None, history=False)  # type: ignore[call-arg]  # fields of all that are no base
+        moving = (state.side != 0) & ~state.overturned & (state.piece >= self.scene.pieces)
+        state = replace(state, done=~moving | ~state.done, steps=jnp.zeros_like(state.steps))
+        return stepper.to_the_end(state)
 
     @abc.abstractmethod
     def finish(self, state: State) -> State:
@@ -112,6 +126,15 @@ class AbstractStepper(eqx.Module):
         if self.scene.far is None:
             return self
         return replace(self, scene=self.scene.on(side))  # type: ignore[call-arg]  # a field of all that are no base
+
+    def at(self: Stepper, state: State | Node) -> Stepper:
+        """Return the stepper for a block in this state: on its side, with what ties remember there."""
+        stepper = self.on(state.side)
+        moments: Any = stepper.scene.moments
+        if not moments.remembers or state.reached is None:
+            return stepper
+        scene = replace(stepper.scene, moments=moments.remembering(state.reached.on(state.side)))
+        return replace(stepper, scene=scene)  # type: ignore[call-arg]
 
     def time(self, state: State | Node) -> Scalar:
         """Return the time of a state [s]."""

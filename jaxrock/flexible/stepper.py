@@ -18,6 +18,7 @@ from jaxrock.blocks.flexible import FlexibleBlock, is_possible
 from jaxrock.blocks.restitution import Reset, on_sides
 from jaxrock.flexible.closeness import approached, mirrored, still_to_come
 from jaxrock.flexible.phases import Arc, Numbers, Phase, arc, locked_phase, rocking_phase
+from jaxrock.motions.floors import with_solved_floors
 from jaxrock.motions.motion import AbstractMotion
 from jaxrock.numerics.derivatives_of import with_derivatives_of
 from jaxrock.numerics.exponential_sums import Curve, first_exit, highest, powers
@@ -119,7 +120,7 @@ class FlexibleScene(eqx.Module):
     @classmethod
     def of(cls, block: FlexibleBlock, ground: AbstractMotion, stop: Real) -> "FlexibleScene":
         """Build the scene from scalars."""
-        numbers = Numbers.of(block)
+        numbers, ground = Numbers.of(block), with_solved_floors(ground)
         rocking, whole = rocking_phase(numbers)
         reset = resets_of(block)
         return cls(block, ground, stop, numbers, locked_phase(numbers), rocking, whole, reset, ground.knots)

@@ -21,7 +21,7 @@ from jaxrock._core.arrays import Values, as_real, shown
 from jaxrock._core.settings import called_by_users
 from jaxrock.compiler.hints import jit_low_effort
 from jaxrock.engines.stepper import AbstractEngine
-from jaxrock.inverse.calibration_grid import LEAST_SEEN, Axis, Table, blocks_of_cells, weighed
+from jaxrock.inverse.calibration_grid import LEAST_SEEN, Axis, Table, blocks_of_cells, model_of_cells, weighed
 from jaxrock.inverse.unknowns import Unknown
 from jaxrock.models.equation import AbstractEquation
 from jaxrock.models.rigid import Housner
@@ -211,7 +211,7 @@ def calibrate_block(
       `lambda alpha: rk.Block(alpha, 3.0)`, or `rk.Block`.
     - `motions`: (tests,) motions as scaled in each test: a `Suite`, or a list from which one can be made.
     - `toppled`: (tests,) 1 toppled, 0 stood, -1 not known.
-    - `unknowns`: an `Unknown` for each parameter that `block` takes: its value, or its median over tests.
+    - `unknowns`: an `Unknown` for each parameter (of the model: "model.edge.radius"): its value, or median over tests.
     - `scatter`: for parameters that differ from test to test (set-up of a rock, its base): the standard deviation of
       the logarithm (of the parameter itself where its `Unknown` is not `log`), a number or an `Unknown`. At least one
       parameter must have scatter.
@@ -239,10 +239,9 @@ def calibrate_block(
     places = {**unknowns, **{f"{name}_sd": each for name, each in scatter.items() if isinstance(each, Unknown)}}
     places = {name: places[name] for name in sorted(places)}  # as JAX orders what a program is given
     seen, ways, told = _tests(len(suite), toppled, facing, rotation)
-    lanes, dealt = blocks_of_cells(block, axes), _dealt(groups, len(suite), folds)
-    found = scenes_of_suite(
-        lanes, suite, np.array([1.0, -1.0]) if (ways <= 0).any() else np.array([1.0]), model, engine, progress
-    )
+    lanes, varied, dealt = blocks_of_cells(block, axes), model_of_cells(model, axes), _dealt(groups, len(suite), folds)
+    signs = np.array([1.0, -1.0]) if (ways <= 0).any() else np.array([1.0])
+    found = scenes_of_suite(lanes, suite, signs, model, engine, progress, varied)
     table = Table.of(found, seen, ways, told, rotation_sd, tuple(axis.count for axis in axes.values()))
     problem = _Problem(places, axes, table, lapse)
     return _fitted(problem, dealt)

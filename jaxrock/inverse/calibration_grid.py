@@ -13,6 +13,8 @@ from jaxtyping import Array, Float
 from jaxrock._arguments.parameters import leaves_of, shared
 from jaxrock.compiler import checks
 from jaxrock.inverse.unknowns import Unknown
+from jaxrock.models.equation import AbstractEquation
+from jaxrock.studies.parameters import named_of_model
 from jaxrock.studies.suite_scenes import TOPPLED, UNDECIDED, Scenes
 
 # Limits of the usual parameters (Housner's restitution does not exist for wider blocks).
@@ -89,16 +91,38 @@ class Axis(eqx.Module):
         return found[1:-1].at[np.array([0, 1, -2, -1])].add(outer)
 
 
+def _of_cells(axes: dict[str, Axis]) -> dict[str, np.ndarray]:
+    """Return the parameters in all cells, the last one changing fastest."""
+    grid = np.meshgrid(*(axis.values for axis in axes.values()), indexing="ij")
+    return {name: x.ravel() for name, x in zip(axes, grid)}
+
+
+def model_of_cells(model: AbstractEquation, axes: dict[str, Axis]) -> dict[str, np.ndarray]:
+    """Return the parameters of the model in all cells: those whose names begin with "model."."""
+    found, own = {name: x for name, x in _of_cells(axes).items() if _is_of_model(name)}, named_of_model(model)
+    unknown = [name for name in found if name not in own]
+    if unknown:
+        said = f"name parameters of `model`, which has {', '.join(own) or 'none'}, but names {unknown[0]!r}"
+        raise ValueError(f"Argument `unknowns` must {said}.")
+    return found
+
+
+def _is_of_model(name: str) -> bool:
+    return name.startswith("model.")
+
+
 def blocks_of_cells(block: Callable, axes: dict[str, Axis]) -> Any:
     """Return the blocks of all cells, the last parameter changing fastest; shared leaves are stored once."""
-    grid = np.meshgrid(*(axis.values for axis in axes.values()), indexing="ij")
-    made = checks.with_checks(lambda *each: block(**dict(zip(axes, each))))
+    cells = _of_cells(axes)
+    grid = {name: x for name, x in cells.items() if not _is_of_model(name)}
+    made = checks.with_checks(lambda *each: block(**dict(zip(grid, each))))
+    numbers = jnp.arange(next(iter(cells.values())).size)  # the block may be known
     try:
-        found = jax.vmap(made)(*(jnp.asarray(x.ravel()) for x in grid))
+        found = jax.vmap(lambda number, *each: made(*each))(numbers, *map(jnp.asarray, grid.values()))
     except TypeError as error:
-        raise ValueError(f"Argument `block` must make a block of {sorted(axes)}, but: {error}.") from error
+        raise ValueError(f"Argument `block` must make a block of {sorted(grid)}, but: {error}.") from error
     for message, failed in zip(found.messages, found.failed):
-        _check_cells(message, np.asarray(failed), dict(zip(axes, grid)))
+        _check_cells(message, np.asarray(failed), grid or {"cell": np.asarray(numbers)})
     blocks = found.results
     for leaf in leaves_of(blocks):
         if leaf.is_shared and not _is_one(np.asarray(leaf.value)):

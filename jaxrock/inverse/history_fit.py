@@ -6,6 +6,7 @@ therefore begins with a short window of the data. Longer windows follow, each st
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Annotated
 
 import equinox as eqx
@@ -27,6 +28,7 @@ from jaxrock.models.rigid import Housner
 from jaxrock.motions.motion import AbstractMotion
 from jaxrock.numerics.least_squares import Covariance, LeastSquares, Minimum, Progression, covariance, least_squares
 from jaxrock.status import Enumeration, item
+from jaxrock.studies.parameters import named_of_model, rebuilt_model
 
 _GROWTH = 1.6  # ratio of the lengths of consecutive windows
 _WIDE = 0.25  # relative standard error above which a linear model in the parameters no longer describes the data
@@ -60,7 +62,7 @@ class HistoryFit(AbstractTable):
     - `misfit`: root mean square of residuals over scatter, by degrees of freedom. It is near 1 for a good model, and
       exactly 1 where the scatter was estimated.
     - `agreement`: share of the starts that reached this minimum.
-    - `block`, `motion`, `initial`: the fitted scene, for `simulate`. The motion is at rest if none was given.
+    - `block`, `motion`, `model`, `initial`: the fitted scene, for `simulate`. The motion is at rest if none was given.
     - `status`: a `HistoryStatus`; `warnings`: cautions about the result, in words; empty if there are none.
     """
 
@@ -77,6 +79,7 @@ class HistoryFit(AbstractTable):
     agreement: float
     block: Block | AsymmetricBlock
     motion: AbstractMotion
+    model: AbstractEquation
     initial: tuple[float, float]
     status: HistoryStatus
     warnings: tuple[str, ...] = eqx.field(static=True)
@@ -156,6 +159,7 @@ def fit_history(
         - of a block "alpha", "p", "restitution"; of an asymmetric block "alpha1", "alpha2", "p1", "inertia_ratio",
           "radius_ratio", "restitution1", "restitution2"; those of a law of restitution, as "restitution.gentle";
         - those of the motion ("amplitude" [g] also of a record: its peak);
+        - those of the model, by where they are, as "model.edge.radius" of `Rolling(0.1)`;
         - "initial" [rad] and "velocity" [rad/s] at time 0;
         - of the measurement its "delay" [s] behind the motion (until then, the block keeps its state at time 0) and its
           "offset" [rad].
@@ -193,7 +197,8 @@ def fit_history(
     problem = LeastSquares(at, scale, lower, upper)
     progression = Progression(_windows(time.size, first.size), spread, float(_noise(rotation) * np.median(weight)))
     minimum = least_squares(problem, first, progression, starts, seed)
-    return _fit(scene, minimum, covariance(minimum, scale, scatter is not None), problem, rotation, weight, scatter)
+    found = _fit(scene, minimum, covariance(minimum, scale, scatter is not None), problem, rotation, weight, scatter)
+    return replace(found, model=rebuilt_model(model, named_of_model(found.model)))  # with functions as they were given
 
 
 def _data(time: Values, rotation: Values, scatter: Values | None, least: int):
@@ -237,7 +242,7 @@ def _fit(scene: FittedScene, minimum: Minimum, spread: Covariance, problem, rota
     values = np.asarray(scene.values(minimum.point))
     by_coordinates = np.where(scene.logarithmic, values, 1.0)
     both = np.outer(by_coordinates, by_coordinates)
-    block, motion, initial = scene.at(dict(zip(scene.names, jnp.asarray(values))))
+    block, motion, model, initial = scene.at(dict(zip(scene.names, jnp.asarray(values))))
     status, warnings = HistoryStatus.not_simulated, []
     if simulated:
         status, warnings = _judged(scene, minimum, spread, problem, correlated, scatter)
@@ -256,6 +261,7 @@ def _fit(scene: FittedScene, minimum: Minimum, spread: Covariance, problem, rota
         agreement=minimum.agreement,
         block=block,
         motion=motion,
+        model=model,
         initial=(float(initial[0]), float(initial[1])),
         status=status,
         warnings=tuple(warnings),

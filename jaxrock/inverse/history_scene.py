@@ -24,7 +24,7 @@ from jaxrock.responses.arguments import engine_of, start_of
 from jaxrock.responses.current_model import current_model
 from jaxrock.responses.history import simulate
 from jaxrock.status import Status, is_decided
-from jaxrock.studies.parameters import declarations, named, rebuilt
+from jaxrock.studies.parameters import declarations, named, rebuilt, rebuilt_model
 
 _OF_MEASUREMENT = ("initial", "velocity", "delay", "offset")
 
@@ -45,11 +45,11 @@ class FittedScene(eqx.Module):
     def of(cls, block, motion, model, parameters, initial, rotation, engine) -> "FittedScene":
         """Check the names, and fill in the defaults."""
         still = RectangularPulse(0.0, 1.0)
-        check_single(block=block, motion=still if motion is None else motion)
+        check_single(block=block, motion=still if motion is None else motion, model=model)
         free, motion = motion is None, still if motion is None else motion
         if not free and not float(peak_bound(motion)) > 0:
             raise ValueError("Argument `motion` must move the ground; None is free rocking.")
-        allowed = [name for name in named(block, motion) if not (free and name in ("amplitude", "duration"))]
+        allowed = [name for name in named(block, motion, model) if not (free and name in ("amplitude", "duration"))]
         of_law = [name for name in allowed if name.startswith("restitution")]
         names = (*_SHAPE[type(block)], *of_law, "initial") if parameters is None else tuple(parameters)
         allowed += _OF_MEASUREMENT
@@ -63,7 +63,7 @@ class FittedScene(eqx.Module):
         if engine is None:
             engine = Series(order=8, tolerance=1e-10) if model.is_series else engine_of(None, model, motion)
         model = current_model(model, block, motion)
-        return cls(names, block, motion, model, start_of(initial), engine)
+        return cls(names, block, motion, model, start_of(initial, block=block), engine)
 
     @property
     def logarithmic(self) -> np.ndarray:
@@ -83,7 +83,7 @@ class FittedScene(eqx.Module):
 
     @property
     def _declared(self) -> dict[str, Parameter]:
-        return declarations(self.block, self.motion)
+        return declarations(self.block, self.motion, self.model)
 
     def _natural_size(self, name: str, value: float) -> float:
         """Return the natural size of a parameter: its value; 1 for angles and numbers that may be negative."""
@@ -96,7 +96,7 @@ class FittedScene(eqx.Module):
         """Return the start of the fit, natural sizes of its coordinates, and both ends of their open intervals."""
         alpha, p = map(float, _size(self.block))
         sizes = {"initial": alpha, "velocity": alpha * p, "delay": 1 / p, "offset": alpha}
-        known = named(self.block, self.motion) | dict(zip(("initial", "velocity"), self.initial))
+        known = named(self.block, self.motion, self.model) | dict(zip(("initial", "velocity"), self.initial))
         values = np.array([float(known.get(name, 0.0)) for name in self.names])
         scale = np.array([sizes.get(n) or self._natural_size(n, x) for n, x in zip(self.names, values)])
         reach = float(self._reach)
@@ -114,22 +114,21 @@ class FittedScene(eqx.Module):
         """Largest |delay| of the measurement [s]; the user should shift data by more than that before the fit."""
         return 2 / _size(self.block)[1]
 
-    def at(self, values: dict) -> tuple[Any, AbstractMotion, tuple]:
-        """Return block, motion and initial state with other parameters."""
-        before = named(self.block, self.motion)
+    def at(self, values: dict) -> tuple[Any, AbstractMotion, AbstractEquation, tuple]:
+        """Return block, motion, model and initial state with other parameters."""
+        before = named(self.block, self.motion, self.model)
         after = {name: values.get(name, x) for name, x in before.items()}
         block, motion = rebuilt(self.block, self.motion, after, before["amplitude"])
-        return block, motion, (values.get("initial", self.initial[0]), values.get("velocity", self.initial[1]))
+        model = rebuilt_model(self.model, after)
+        return block, motion, model, (values.get("initial", self.initial[0]), values.get("velocity", self.initial[1]))
 
     def rotation(self, point, time, until):
         """Return the rotation at times up to `until`, and whether the engine computed the response."""
         values = dict(zip(self.names, self.values(point)))
         duration = until + (self._reach if "delay" in self.names else 0.0)
         with checks.collect() as collected:
-            block, motion, initial = self.at(values)
-            response = simulate(
-                block, motion, self.model, initial=initial, duration=duration, engine=self.engine, samples=2
-            )
+            block, motion, model, initial = self.at(values)
+            response = simulate(block, motion, model, initial=initial, duration=duration, engine=self.engine, samples=2)
             at = jnp.clip(time - values.get("delay", 0.0), 0.0, duration)
             rotation, _ = response(at)
             # Beyond the point where the motion is lost, a slope is no slope.
@@ -151,7 +150,7 @@ def _size(block: Block | AsymmetricBlock) -> tuple[Array, Array]:
 def _given(block: Block | AsymmetricBlock, names: Sequence[str]) -> Block | AsymmetricBlock:
     """Return the block with explicit values for fitted parameters that would otherwise follow from others."""
     if isinstance(block, Block):
-        return Block(block.alpha, block.p, block.restitution) if "restitution" in names else block
+        return Block(block.alpha, block.p, block.restitution, opens=block.opens) if "restitution" in names else block
     radii = block.radius_ratio if "radius_ratio" in names else block.given_radius_ratio
     fitted = "restitution1" in names or "restitution2" in names
     law = (block.restitution1, block.restitution2) if fitted else block.law

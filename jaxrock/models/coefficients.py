@@ -8,12 +8,9 @@ every model of a rigid block reads
 A coefficient that a model does not have is None: no code is generated for it.
 """
 
-import functools
 import math
-import operator
-from collections.abc import Callable
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -23,10 +20,9 @@ from jaxrock._core.types import Scalar
 from jaxrock.compiler.hints import select
 from jaxrock.models import free_swing
 from jaxrock.models.equation import AbstractMoments, Angle
+from jaxrock.models.terms import UNIT_FUNCTION, Basis, TermGroups, Terms
 from jaxrock.numerics.elementary import sine_cosine
 from jaxrock.numerics.polynomial import sum_of_products
-
-_ONE = 1.0
 
 
 def _or_zero(coefficient: Scalar | float | None) -> Scalar | float:
@@ -43,85 +39,7 @@ def _weighed(weight: Scalar | None, moment: Scalar) -> Scalar:
     return moment if weight is None else weight * moment
 
 
-class Basis(NamedTuple):
-    """The functions that the coefficients of `Terms` multiply: 1, x, sin x and cos x at an angle, or term k of their
-    series.
-
-    None: zero, or not needed.
-    """
-
-    constant: Any
-    line: Any
-    sine: Any
-    cosine: Any
-
-    @classmethod
-    def at(cls, angle: Angle) -> "Basis":
-        """Evaluate the functions at an angle."""
-        return cls(_ONE, angle.value, angle.sine, angle.cosine)
-
-    @classmethod
-    def of_term(cls, k: int, line: list, sine: list, cosine: list) -> "Basis":
-        """Return term k of their series; sine and cosine may be shorter, where no moment has them."""
-        of_sine, of_cosine = (series[k] if k < len(series) else None for series in (sine, cosine))
-        return cls(_ONE if k == 0 else None, line[k], of_sine, of_cosine)
-
-    def term(self, k: int) -> "Basis":
-        """Return term k of series; None where a series is shorter."""
-        return Basis(*(None if series is None or k >= len(series) else series[k] for series in self))
-
-    @property
-    def derivative(self) -> "Basis":
-        """Return the derivatives of these functions by the angle."""
-        return Basis(None, self.constant, self.cosine, None if self.sine is None else -self.sine)
-
-
-class Terms(eqx.Module):
-    """A moment, or an arm: coefficients of 1, x, sin x and cos x; None for an absent term."""
-
-    constant: Scalar | float | None = None
-    line: Scalar | float | None = None
-    sine: Scalar | float | None = None
-    cosine: Scalar | float | None = None
-
-    @property
-    def coefficients(self) -> tuple[Scalar | float | None, ...]:
-        """Return the coefficients in the order of `Basis`."""
-        return self.constant, self.line, self.sine, self.cosine
-
-    @property
-    def trigonometric(self) -> bool:
-        """Return whether there is a term in sin x or cos x."""
-        return self.sine is not None or self.cosine is not None
-
-    def summed(self, basis: Basis, empty: Any = 0.0) -> Any:
-        """Return the sum of coefficients times functions; `empty` where there is no such pair."""
-        pairs = [(c, f) for c, f in zip(self.coefficients, basis) if c is not None and f is not None]
-        alone, pairs = [c for c, f in pairs if f is _ONE], [pair for pair in pairs if pair[1] is not _ONE]
-        if len(pairs) > 1:
-            alone.append(sum_of_products(*map(list, zip(*pairs))))
-        elif pairs:
-            alone.append(pairs[0][0] * pairs[0][1])
-        return functools.reduce(operator.add, alone) if alone else empty
-
-    def products(self, basis: Basis, sign: Scalar | None = None) -> list:
-        """Return coefficients times functions, where both exist; `sign` multiplies all of them."""
-        pairs = [(c, f) for c, f in zip(self.coefficients, basis) if c is not None and f is not None]
-        pairs = pairs if sign is None else [(sign * c, f) for c, f in pairs]
-        return [c if f is _ONE else c * f for c, f in pairs]
-
-    def plus(self, other: "Terms") -> "Terms":
-        """Return the sum of both."""
-        pairs = zip(self.coefficients, other.coefficients)
-        return Terms(*(a if b is None else b if a is None else a + b for a, b in pairs))
-
-    def each(self, function: Callable, *others: Any) -> "Terms":
-        """Apply a function to every coefficient that is not None, with its counterparts in `others`."""
-        pairs = zip(self.coefficients, *others)
-        return Terms(*(None if c is None else function(c, *more) for c, *more in pairs))
-
-
-_AT_REST = Basis(_ONE, None, None, _ONE)  # sin 0 is zero
+_AT_REST = Basis(constant=UNIT_FUNCTION, cosine=UNIT_FUNCTION)  # sin 0 is zero
 _FLAT = Angle(math.pi / 2, 1.0, 0.0)
 
 
@@ -146,11 +64,31 @@ class Coefficients(AbstractMoments):
     def __check_init__(self) -> None:
         moment = self.restoring_terms
         straight = moment.constant is not None and moment.line is not None and not moment.trigonometric
-        if not straight and (moment.sine is None or moment.line is not None):
+        known = not any(terms.has_half or terms.has_double for terms in (moment, self.arm_terms))
+        if not known or (not straight and (moment.sine is None or moment.line is not None)):
             raise ValueError(
                 "Argument `restoring_terms` must be a constant and a line, or a sine, a cosine and a constant, but is "
                 f"{moment}. Use an `Equation` for any other moment."
             )
+
+    @property
+    def has_series(self) -> bool:
+        """Return True: sums of these terms have a Taylor recurrence."""
+        return True
+
+    @property
+    def has_free_swing(self) -> bool:
+        """Return True: the energy of these terms is known."""
+        return True
+
+    @property
+    def groups(self) -> TermGroups:
+        """Return the terms by what multiplies them."""
+        return TermGroups(self.restoring_terms, self.arm_terms)
+
+    def with_groups(self, groups: TermGroups) -> "Coefficients":
+        """Return other moments of this kind, of these terms alone."""
+        return Coefficients(groups.restoring, groups.arm, arm_lasts=self.arm_lasts)
 
     @property
     def bare(self) -> "Coefficients":
@@ -169,7 +107,7 @@ class Coefficients(AbstractMoments):
     @property
     def trigonometric(self) -> bool:
         """Return whether restoring moment or arm has a term in sin x or cos x."""
-        return self.restoring_terms.trigonometric or self.arm_terms.trigonometric
+        return self.groups.trigonometric
 
     def restoring(self, angle: Angle) -> Scalar:
         """Return the restoring moment over m g R at an opening angle."""
@@ -288,7 +226,7 @@ class Coefficients(AbstractMoments):
         moment, arm, factor = self.restoring_terms, self.arm_terms, 1.0 if weight is None else weight
         if self.sinusoidal and self.skew is None and arm.constant is None:
             sines, cosines = (
-                Terms(*pair).summed(Basis(factor, push, None, None))
+                Terms(*pair).summed(Basis(factor, push))
                 for pair in ((moment.sine, arm.sine), (moment.cosine, arm.cosine))
             )
             return jnp.sqrt(2 * jnp.maximum(_length(sines, cosines) - self.repulsion(angle, push, weight), 0.0))
@@ -321,3 +259,43 @@ class Coefficients(AbstractMoments):
         # The restoring moment falls, or rises again: it is largest at an end. Beyond pi/2 no moment counts as holding.
         may = (flat > 0) | (_weighed(weight, jnp.maximum(self.restoring(angle), flat)) + most > 0)
         return select(may & (angle.value < jnp.pi / 2), jnp.inf, 0.0)
+
+
+def of_one_kind(first: AbstractMoments, second: AbstractMoments) -> tuple[AbstractMoments, AbstractMoments]:
+    """Return the moments of both sides of a block as pytrees of one structure, between which a program may choose.
+
+    A term that only one side's `Coefficients` have is zero on the other.
+
+    **Raises:** ValueError for moments that have no common form.
+    """
+    kinds = {jax.tree.structure(moments) for moments in (first, second)}
+    if len(kinds) == 1:
+        return first, second
+    if not isinstance(first, Coefficients) or not isinstance(second, Coefficients):
+        said = f"{type(first).__name__} and {type(second).__name__}"
+        said = said if type(first) is not type(second) else f"two different programs of {type(first).__name__}"
+        raise ValueError(
+            f"Argument `model` must have moments of one kind on both sides of a block, but has {said}. One function "
+            "that depends on numbers of its own or of its `block` serves both sides."
+        )
+    if first.sinusoidal != second.sinusoidal:
+        raise ValueError(
+            "Argument `model` must have restoring moments of one kind on both sides of a block, but has a straight "
+            "line on one and a sinusoid on the other: give both as an `Equation`."
+        )
+    parts = {
+        name: [_with_terms_of(*pair) for pair in ((one, other), (other, one))]
+        for name in ("restoring_terms", "arm_terms")
+        for one, other in [(getattr(first, name), getattr(second, name))]
+    }
+    lasts = first.arm_lasts and second.arm_lasts
+    made = [
+        Coefficients(restoring, arm, side.saddle, lasts)
+        for restoring, arm, side in zip(*parts.values(), (first, second))
+    ]
+    return made[0], made[1]
+
+
+def _with_terms_of(terms: Terms, other: Terms) -> Terms:
+    pairs = zip(terms.coefficients, other.coefficients)
+    return Terms(*(jnp.zeros_like(b) if a is None and b is not None else a for a, b in pairs))

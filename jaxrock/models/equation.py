@@ -23,6 +23,7 @@ from jaxrock.numerics.gauss_legendre import gauss_legendre_of_unit
 from jaxrock.numerics.roots import carried
 
 _GAUSS = gauss_legendre_of_unit(12)
+_STEPS = 256  # of a scan from rest to pi/2
 
 
 class Angle(NamedTuple):
@@ -99,6 +100,18 @@ class AbstractMoments(eqx.Module):
         block."""
         return 0.0
 
+    def fall(self, angle: Angle) -> Scalar:
+        """Return how far the restoring moment changes from an opening angle to the balance: rises count like falls.
+
+        That is the moment itself, unless it rises somewhere. The margin of an outcome is measured by it.
+        """
+        return self.restoring(angle)
+
+    @property
+    def fall_at_rest(self) -> Scalar:
+        """Return `fall` at rest."""
+        return self.restoring_at_rest
+
     def held(self, angle: Angle, velocity: Scalar, push: Scalar, weight: Scalar | None = None) -> Scalar:
         """Return the largest inward acceleration under a forcing of at most this size [g]."""
         return -self.acceleration(angle, velocity, push, weight)
@@ -139,6 +152,41 @@ class AbstractMoments(eqx.Module):
         """Return the ground acceleration at which the block uplifts [g]: tan(alpha), or alpha in the linear model."""
         return self.restoring_at_rest / self.arm_at_rest
 
+    @property
+    def threshold_of_weight(self) -> Scalar | None:
+        """Return the part of the threshold that the weight holds [g]; None where that is all of it."""
+        return None
+
+    @property
+    def has_series(self) -> bool:
+        """Return whether the opening angle has a Taylor recurrence, so that the series engine can follow it."""
+        return False
+
+    @property
+    def is_damped(self) -> bool:
+        """Return whether a moment is known to depend on the velocity."""
+        return False
+
+    @property
+    def has_free_swing(self) -> bool:
+        """Return whether free swings are known in closed form."""
+        return False
+
+    @property
+    def remembers(self) -> bool:
+        """Return whether moments depend on the largest opening angle so far, as `remembering` tells them."""
+        return False
+
+    @property
+    def balanced(self) -> "AbstractMoments":
+        """Return the moments with the saddle, computed once for all its uses."""
+        return self
+
+    @property
+    def steepest_start(self) -> Scalar:
+        """Return an estimate of the rate at which the restoring moment changes with the angle near rest."""
+        return self.stiffness
+
     def change_at_rest(self, horizontal: Scalar, vertical: Scalar | None) -> Scalar:
         """Bound the change of the acceleration just after uplift by the changes of the ground acceleration."""
         change = horizontal * self.arm_at_rest
@@ -154,12 +202,19 @@ class AbstractEquation(Owner):
       angle. The series engine solves it, exact to rounding, and in machine code.
     - The moments of an `Equation` made of functions. The diffrax engine solves it, and `is_series` is false.
 
-    Its fields are parameters. Arrays among them may be differentiated by, and may differ from lane to lane under
-    `jax.vmap`.
+    Its fields are parameters: arrays, or dictionaries, tuples and modules of these. Arrays among them may be
+    differentiated by, and may differ from lane to lane under `jax.vmap`. Single numbers have names in `sensitivity` and
+    fits, `model.` and their path. A method `parameter_path(path)` may return a shorter path.
     """
 
     def __check_init__(self):
         check_declared(self)
+
+    def __add__(self, restraint: Any) -> "AbstractEquation":
+        """Return the model with a restraint, such as `rk.Housner() + rk.models.Tendon(...)`."""
+        if not hasattr(restraint, "restrains"):
+            return NotImplemented
+        return restraint.restrains(self)
 
     @abc.abstractmethod
     def moments(self, block: Block | Side) -> AbstractMoments:
@@ -188,9 +243,61 @@ class AbstractEquation(Owner):
         return True
 
     @property
+    def forces_follow(self) -> bool:
+        """Return whether the forces of the ground follow from the rotation, as `contact_forces` computes them.
+
+        They do where the block is rigid, turns about its corners or rolls on its edges, and only weight and ground act
+        on it.
+        """
+        return False
+
+    @property
     def feels_weight(self) -> bool:
         """Return whether a vertical acceleration changes the restoring moment; if not, vertical motions are refused."""
         return True
+
+
+class Summit(eqx.Module):
+    """The largest restoring moment below the balance, and the opening angle where it acts."""
+
+    angle: Scalar  # by a scan, without derivatives; 0 where the moment only falls
+    moment: Scalar
+
+    @classmethod
+    def of(cls, restoring: Callable, saddle: Scalar) -> "Summit":
+        """Find it for a restoring moment, a function of an `Angle`."""
+        step = jnp.pi / 2 / _STEPS
+
+        def moment(x):
+            return jax.lax.stop_gradient(restoring(Angle.of(x)))
+
+        def higher(k, best):
+            x = k.astype(saddle.dtype) * step
+            value = moment(x)
+            better = (value > best[1]) & (x < saddle)
+            return select(better, x, best[0]), select(better, value, best[1])
+
+        zero = jnp.zeros_like(jax.lax.stop_gradient(saddle))
+        at, middle = jax.lax.fori_loop(1, _STEPS + 1, higher, (zero, moment(zero)))
+        # The top of the parabola through the highest angle of the scan and its neighbours.
+        low, high = moment(jnp.maximum(at - step, 0.0)), moment(at + step)
+        bend = 2 * middle - low - high
+        shift = select(bend > 0, (high - low) / (2 * select(bend > 0, bend, 1.0)), 0.0)
+        angle = select(at == 0, 0.0, at + jnp.clip(shift, -0.5, 0.5) * step)
+        angle = jax.lax.stop_gradient(angle)
+        return cls(angle, restoring(Angle.of(angle)))
+
+    def times(self, factor: Scalar | float) -> "Summit":
+        """Multiply the moment by a factor."""
+        return Summit(self.angle, factor * self.moment)
+
+    def fall(self, angle: Angle, moment: Scalar) -> Scalar:
+        """Return `AbstractMoments.fall` at an angle where this moment acts, of moments that rise up to the summit."""
+        return select(angle.value < self.angle, 2 * self.moment - moment, moment)
+
+    def fall_at_rest(self, moment: Scalar) -> Scalar:
+        """Return `fall` at rest, for the moment there."""
+        return select(self.angle > 0, 2 * self.moment - moment, moment)
 
 
 def last_rise(moments: AbstractMoments, like: Scalar) -> Scalar:
@@ -210,7 +317,7 @@ def last_rise(moments: AbstractMoments, like: Scalar) -> Scalar:
 
 
 def _grid(like: Scalar) -> Inexact[Array, " angles"]:
-    return jnp.linspace(0.0, jnp.pi / 2, 257, dtype=like.dtype)
+    return jnp.linspace(0.0, jnp.pi / 2, _STEPS + 1, dtype=like.dtype)
 
 
 def first_zero(moment: Callable, like: Scalar) -> Scalar:

@@ -3,8 +3,9 @@
 import jax.numpy as jnp
 
 from jaxrock.blocks.rigid import Block, Side
-from jaxrock.models.coefficients import Coefficients, Terms
+from jaxrock.models.coefficients import Coefficients
 from jaxrock.models.equation import AbstractEquation
+from jaxrock.models.terms import Terms
 from jaxrock.numerics.elementary import sine_cosine
 
 
@@ -17,6 +18,11 @@ class Housner(AbstractEquation):
         sine, cosine = sine_cosine(block.alpha)  # XLA turns sin/cos quotients into a tangent, which LLVM may lack
         return Coefficients(Terms(sine=-cosine, cosine=sine), Terms(sine=sine, cosine=cosine), arm_lasts=True)
 
+    @property
+    def forces_follow(self) -> bool:
+        """Return True: only weight and ground act on the block."""
+        return True
+
 
 class Linear(AbstractEquation):
     """The slender block linearised about its corner (D&D 2012, 3.1-3.2; Voyagaki et al. 2012, 2.3)."""
@@ -25,6 +31,11 @@ class Linear(AbstractEquation):
         """Return the restoring moment alpha - x, with arm 1."""
         one = jnp.ones_like(block.alpha)
         return Coefficients(Terms(constant=block.alpha, line=-one), Terms(constant=one))
+
+    @property
+    def forces_follow(self) -> bool:
+        """Return True: only weight and ground act on the block."""
+        return True
 
     @property
     def falls_flat(self) -> bool:

@@ -15,7 +15,7 @@ from jaxrock.blocks.asymmetric import AsymmetricBlock
 from jaxrock.blocks.edge import Edge, EdgePieces
 from jaxrock.blocks.restitution import ratio_of_inertia
 from jaxrock.blocks.rigid import Block, Side
-from jaxrock.models.equation import AbstractEquation, AbstractMoments, Angle, Rolled, first_zero, last_rise
+from jaxrock.models.equation import AbstractEquation, AbstractMoments, Angle, Rolled, Summit, first_zero, last_rise
 from jaxrock.numerics.elementary import sine_cosine
 
 
@@ -70,12 +70,21 @@ class Rolling(AbstractEquation):
         """Return the moments of a symmetric block."""
         if self.other is not None:
             raise ValueError("Argument `other` must be None for a symmetric block, whose edges are alike.")
+        if isinstance(block, Block) and block.beam is not None:
+            raise ValueError(
+                "Argument `block` must be one body in a `Rolling`, but is a frame, whose columns do not roll."
+            )
         return RollingMoments.of(block.alpha, self.inertia_ratio, self.edge)
 
     def moments_of_sides(self, block: AsymmetricBlock) -> tuple["RollingMoments", "RollingMoments"]:
         """Return the moments of both sides of an asymmetric block."""
         first = RollingMoments.of(block.alpha1, block.inertia_ratio, self.edge)
         return first, RollingMoments.of(block.alpha2, block.inertia_ratio2, self.other or self.edge)
+
+    @property
+    def forces_follow(self) -> bool:
+        """Return True: only weight and ground act on the block."""
+        return True
 
     @property
     def is_series(self) -> bool:
@@ -91,18 +100,19 @@ class RollingMoments(AbstractMoments):
     pieces: EdgePieces
     factor: Scalar  # multiplies all accelerations (see `times`)
     saddle: Scalar
+    summit: Summit
     firm: Scalar | None = None  # angle past which the block gets no firmer (`last_rise`); None: a circle
 
     @classmethod
     def of(cls, alpha: Scalar, ratio: Scalar, edge: Edge) -> "RollingMoments":
         """Compute the moments of a block, or of a side."""
-        made = cls(Angle.of(alpha), ratio, edge.pieces(), jnp.ones_like(alpha), alpha)
-        firm = None if edge.angle is None else _firm(made)
-        return replace(made, saddle=_balance(made), firm=firm)
+        made = cls(Angle.of(alpha), ratio, edge.pieces(), jnp.ones_like(alpha), alpha, Summit(alpha, alpha))
+        firm, saddle = None if edge.angle is None else _firm(made), _balance(made)
+        return replace(made, saddle=saddle, firm=firm, summit=_summit(made, saddle))
 
     def times(self, factor: Scalar | float) -> "RollingMoments":
         """Multiply all accelerations by a factor."""
-        return replace(self, factor=factor * self.factor)
+        return replace(self, factor=factor * self.factor, summit=self.summit.times(factor))
 
     @property
     def bends(self) -> int:
@@ -139,6 +149,15 @@ class RollingMoments(AbstractMoments):
         """Return the restoring moment over m g R at an opening angle, with the moment of inertia at rest."""
         at = self.rolled(angle)
         return self.factor * at.reach / self._inertia(at)
+
+    def fall(self, angle: Angle) -> Scalar:
+        """Return how far the restoring moment changes from an opening angle to the balance."""
+        return self.summit.fall(angle, self.restoring(angle))
+
+    @property
+    def fall_at_rest(self) -> Scalar:
+        """Return `fall` at rest."""
+        return self.summit.fall_at_rest(self.restoring_at_rest)
 
     def arm(self, angle: Angle) -> Scalar:
         """Return the overturning moment over m R u g at an opening angle, with the moment of inertia at rest."""
@@ -187,6 +206,11 @@ class RollingMoments(AbstractMoments):
 def _balance(moments: RollingMoments) -> Scalar:
     """Return the opening angle at which the centre of mass is over the point of contact, at most pi/2."""
     return first_zero(lambda x: moments.rolled(Angle.of(x)).reach, moments.saddle)
+
+
+@one_program
+def _summit(moments: RollingMoments, saddle: Scalar) -> Summit:
+    return Summit.of(moments.restoring, saddle)
 
 
 @one_program

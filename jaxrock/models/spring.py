@@ -6,8 +6,9 @@ from jaxtyping import Array, Inexact
 
 from jaxrock._arguments.ranges import checked, one_of, whole
 from jaxrock.blocks.rigid import Block, Side
-from jaxrock.models.coefficients import Coefficients, Terms
+from jaxrock.models.coefficients import Coefficients
 from jaxrock.models.equation import AbstractEquation
+from jaxrock.models.terms import Terms
 from jaxrock.numerics.elementary import sine_cosine
 
 

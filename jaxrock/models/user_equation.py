@@ -1,7 +1,8 @@
 """An equation of motion of the user's own, written as functions."""
 
 from collections.abc import Callable
-from typing import cast
+from dataclasses import replace
+from typing import Any, cast
 
 import equinox as eqx
 import jax
@@ -12,14 +13,16 @@ from jaxtyping import Array, Bool, Inexact
 from jaxrock._arguments.annotations import arguments
 from jaxrock._arguments.parameters import parameter, set_parameters
 from jaxrock._arguments.ranges import checked, positive
-from jaxrock._core.arrays import Values
+from jaxrock._core.arrays import Values, is_traced
 from jaxrock._core.types import Scalar
 from jaxrock.blocks.restitution import Constant
 from jaxrock.blocks.rigid import Block, Side
+from jaxrock.compiler import trace_function
 from jaxrock.compiler.hints import select
-from jaxrock.models.equation import AbstractEquation, AbstractMoments, Angle, first_zero, last_rise
+from jaxrock.models.equation import AbstractEquation, AbstractMoments, Angle, Summit, first_zero, last_rise
 from jaxrock.numerics.lookup import stretch_from, take
 
+_CHECKED = (0.0, 0.25, 0.5, 0.75, 1.0)  # opening angles over alpha at which dissipation must not jump
 _CREEP = 1e-30  # a velocity so small that only a jump at zero velocity shows
 
 
@@ -46,7 +49,8 @@ class Equation(AbstractEquation):
     and pi/2. Dry friction is nearly k tanh(v/w), with a small w. At a bend that `bends` does not list, values keep the
     tolerance, but slopes are off by 1e-5 to 1e-3, without a warning.
 
-    Functions that are Equinox modules may carry parameters to differentiate. Functions may read variables that change:
+    Functions that are Equinox modules may carry parameters to differentiate by, with names such as
+    `model.restoring.stiffness` in `sensitivity` and fits. Functions may read variables that change:
     every call of the package sees current values (under your `jax.jit`, those of the trace). A block that has stopped
     below its unstable equilibrium after the motion counts as safe: dissipation does not lift it.
 
@@ -54,7 +58,7 @@ class Equation(AbstractEquation):
     equation, for dissipation that jumps at rest, and for an acceleration that is not linear in the push.
     """
 
-    _acceleration: Callable
+    _acceleration: "Functions"
     _falls_flat: bool = eqx.field(static=True)
     bends: Inexact[Array, " bends"] | None = parameter("rad", positive, axes=1)
 
@@ -83,7 +87,14 @@ class Equation(AbstractEquation):
 
     def moments(self, block: Block | Side) -> "FunctionMoments":
         """Return the moments of one block, as the engine calls them."""
-        return FunctionMoments(self._acceleration, block, bends_at=self.bends)
+        function = self._acceleration
+        if not function.is_current and is_traced(block):  # functions of a model's method hold what that trace holds
+            function = function.current(block.alpha.dtype, as_functions_see(block))
+        return FunctionMoments(function, block, bends_at=self.bends)
+
+    def parameter_path(self, path: tuple[str, ...]) -> tuple[str, ...]:
+        """Return the path that names a parameter, such as `restoring.stiffness`."""
+        return path[1:] if path[0] == "_acceleration" else path
 
     def at_rest(self, block: Block | Side) -> tuple[Scalar, Scalar]:
         """Return the restoring moment and overturning arm just after uplift, which must be positive."""
@@ -92,8 +103,7 @@ class Equation(AbstractEquation):
         return -alone, alone - pushed
 
     def faults(self, block: Block | Side) -> dict[str, Bool[Array, ""]]:
-        """Check the functions just after uplift, and at half the slenderness. Return messages, each with whether its
-        fault occurs."""
+        """Check the functions just after uplift and further on. Return messages, each with whether its fault occurs."""
         zero = jnp.zeros_like(block.alpha)
         alone, arm = self.at_rest(block)
 
@@ -101,7 +111,12 @@ class Equation(AbstractEquation):
             return -self._acceleration(zero + opening, zero + velocity, zero + push, as_functions_see(block))
 
         noise = 1e3 * jnp.finfo(zero.dtype).eps * (jnp.abs(alone) + jnp.abs(arm))
-        jump = jnp.abs(moment(velocity=_CREEP) - moment(velocity=-_CREEP))
+
+        def jump(share):
+            one, other = (moment(velocity=velocity, opening=share * block.alpha) for velocity in (_CREEP, -_CREEP))
+            return jnp.abs(one - other)
+
+        jumps = jnp.max(jax.vmap(jump)(jnp.asarray(_CHECKED, zero.dtype)), axis=0)
         bends = []
         for opening in (zero, 0.5 * block.alpha):
             at_none, at_one, at_two = (moment(push=push, opening=opening) for push in (0.0, 1.0, 2.0))
@@ -110,7 +125,7 @@ class Equation(AbstractEquation):
             "The restoring moment must be positive at rotation 0": alone <= 0,
             "The overturning arm must be positive at rotation 0": arm <= 0,
             "The dissipation must not jump where the velocity changes its sign: dry friction is nearly "
-            "k tanh(v/w) with a small w, not k sign(v)": jump > noise,
+            "k tanh(v/w) with a small w, not k sign(v)": jumps > noise,
             "The acceleration must be linear in the push of the ground": jnp.maximum(*bends) > noise,
         }
 
@@ -126,16 +141,47 @@ class Equation(AbstractEquation):
 
 
 class Functions(eqx.Module):
-    """Functions, as leaves where they are modules (with parameters) and static where they are plain."""
+    """Functions, as leaves where they are modules (with parameters) and static where they are plain.
+
+    - `traced`: all of them together as they were at the time of a call; None: not yet traced.
+    """
 
     modules: tuple
     plain: tuple = eqx.field(static=True)
+    traced: Any
 
-    def __init__(self, parts: tuple):
+    def __init__(self, parts: tuple, traced: Any = None):
         self.modules = tuple(f if isinstance(f, eqx.Module) else None for f in parts)
         self.plain = tuple(None if isinstance(f, eqx.Module) else f for f in parts)
+        self.traced = traced
 
-    def __call__(self, x: Scalar, v: Scalar, push: Scalar, block: Block | Side) -> Scalar:
+    @property
+    def is_current(self) -> bool:
+        """Return whether the functions have been traced: a pytree for `jax.jit`."""
+        return self.traced is not None
+
+    def current(self, dtype: Any, block: Any) -> "Functions":
+        """Trace the functions as they are now, for numbers of a type and for blocks like this one."""
+        number = jax.ShapeDtypeStruct((), dtype)
+        traced: Any = trace_function(self, number, number, number, jax.tree.map(lambda leaf: number, block))
+        # The modules keep their arrays, which are parameters; the program holds their other parts.
+        return type(self)(eqx.filter(self.modules, eqx.is_array_like), replace(traced, arrays=()))
+
+    def parameter_path(self, path: tuple[str, ...]) -> tuple[str, ...] | None:
+        """Return the path that names a parameter, after the function that holds it."""
+        field, *rest = path
+        if field == "traced":
+            return None
+        roles = ("restoring", "arm", "dissipation") if len(self.modules) > 1 else ("acceleration",)
+        return roles[int(rest[0])], *rest[1:]
+
+    def __call__(self, x: Scalar, v: Scalar, push: Scalar, block: Block | Side | None) -> Any:
+        if self.traced is not None:
+            return replace(self.traced, arrays=tuple(jax.tree.leaves(self.modules)))(x, v, push, block)
+        return self.as_written(x, v, push, block)
+
+    def as_written(self, x: Scalar, v: Scalar, push: Scalar, block: Block | Side | None) -> Any:
+        """Call the functions as they are now."""
         parts = [m if m is not None else f for m, f in zip(self.modules, self.plain)]
         if len(parts) == 1:
             return parts[0](x, v, push, block)
@@ -149,6 +195,8 @@ def as_functions_see(block: Block | Side) -> Block | Side:
     kind."""
     if isinstance(block, Side):
         return block
+    if block.beam is not None:
+        block = eqx.tree_at(lambda frame: frame.beam, block, None)
     law = eqx.tree_at(lambda constant: constant.value, Constant(0.0), block.restitution)
     return eqx.tree_at(lambda b: b.law, block, law, is_leaf=lambda x: x is block.law)
 
@@ -165,6 +213,7 @@ class FunctionMoments(AbstractMoments):
     arm_at_rest: Scalar
     saddle: Scalar  # first zero of the restoring moment, at most pi/2
     firm: Scalar  # angle past which the block gets no firmer (`last_rise`)
+    summit: Summit
 
     def __init__(
         self,
@@ -182,6 +231,7 @@ class FunctionMoments(AbstractMoments):
         )
         self.saddle = first_zero(lambda x: self.restoring(Angle.of(x)), block.alpha)
         self.firm = last_rise(self, block.alpha)
+        self.summit = Summit.of(self.restoring, self.saddle)
 
     def acceleration(self, angle: Angle, velocity: Scalar, push: Scalar, weight: Scalar | None = None) -> Scalar:
         """Return the acceleration of the opening angle per (p t)^2; push = side u, weight = 1 + v (None: 1)."""
@@ -222,6 +272,15 @@ class FunctionMoments(AbstractMoments):
         """Return the restoring moment over m g R at an opening angle."""
         zero = jnp.zeros_like(angle.value)
         return -self._value(angle, zero, zero)
+
+    def fall(self, angle: Angle) -> Scalar:
+        """Return how far the restoring moment changes from an opening angle to the balance."""
+        return self.summit.fall(angle, self.restoring(angle))
+
+    @property
+    def fall_at_rest(self) -> Scalar:
+        """Return `fall` at rest."""
+        return self.summit.fall_at_rest(self.restoring_at_rest)
 
     def arm(self, angle: Angle) -> Scalar:
         """Return the overturning moment over m R u g at an opening angle."""

@@ -23,6 +23,7 @@ from jaxrock.motions.files.writing import (
     write_at2 as write_at2,
     write_csv as write_csv,
 )
+from jaxrock.motions.floors import on_floor as on_floor
 from jaxrock.motions.motion import (
     AbstractMotion as AbstractMotion,
     WithVertical as WithVertical,

@@ -61,8 +61,7 @@ class MergedKnots(NamedTuple):
 
         None for few pieces: stepping over them one by one is as quick.
         """
-        knots = self.knots
-        return _following(knots) if knots.size > _FEW else None
+        return following_of(self.knots)
 
     def places(self, piece: Int[Array, "..."]) -> tuple[Place, Place]:
         """Return the places of both motions in merged pieces."""
@@ -114,6 +113,11 @@ def _in_order(_, knots: tuple, changes: tuple) -> Inexact[Array, " finer"]:
         if change is not None:
             found = found + jnp.sum(select(place == numbers, change, 0.0), axis=1)
     return jnp.asarray(found)
+
+
+def following_of(knots: Inexact[Array, " knots"]) -> Int[Array, " knots"] | None:
+    """Return, for each piece and for the end, the first piece from there on with a length; None for few pieces."""
+    return _following(knots) if knots.size > _FEW else None
 
 
 @jax.custom_jvp

@@ -6,28 +6,31 @@ and its Taylor series at any point of a piece. Accelerations are in g; a positiv
 
 import abc
 import functools
+import itertools
+from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Inexact, Int
 
 from jaxrock._arguments.annotations import arguments
-from jaxrock._arguments.parameters import Owner, check_declared, parameter, set_parameters
+from jaxrock._arguments.parameters import check_declared, parameter, set_parameters
 from jaxrock._arguments.ranges import delay, factor, if_known, not_nan, with_throw
 from jaxrock._arguments.repr import described
-from jaxrock._core.arrays import Values, of_each
+from jaxrock._core.arrays import Values
 from jaxrock._core.types import Scalar
 from jaxrock.compiler.hints import select
+from jaxrock.motions.derived_pieces import RestOfPieces, SamePieces
+from jaxrock.motions.interface import AbstractPieces, Piece as Piece
 from jaxrock.motions.merged_knots import MergedKnots
+from jaxrock.motions.merged_parts import MergedPair, MergedParts
 from jaxrock.motions.nesting import check_nesting
 from jaxrock.motions.pieces import Extent, acceleration_at
-from jaxrock.motions.shaking import Bounds, Envelope, sum_of_series
-from jaxrock.numerics.lookup import take
-
-Piece = Int[Array, ""]  # number of a smooth piece
+from jaxrock.motions.shaking import Bounds, Envelope
 
 
-class AbstractMotion(Owner):
+class AbstractMotion(AbstractPieces):
     """The interface of every ground motion: `acceleration(t)`, `knots`, `end`, and series for the engines."""
 
     __repr__ = described
@@ -37,73 +40,9 @@ class AbstractMotion(Owner):
         check_nesting(self)
 
     @property
-    @abc.abstractmethod
-    def knots(self) -> Inexact[Array, " knots"]:
-        """Times that bound the smooth pieces, from 0 to the end of the motion [s], never decreasing."""
-
-    @property
-    def lengths(self) -> Inexact[Array, " pieces"]:
-        """Durations of the pieces [s]; exact also for a motion that begins late, whose knots are rounded."""
-        return jnp.diff(self.knots)
-
-    def length(self, piece: Piece) -> Scalar:
-        """Return the duration of one piece [s]."""
-        return take(self.lengths, piece)
-
-    @property
-    def lasting(self) -> Extent:
-        """The last piece with a positive length, and whether time runs forward in every piece."""
-        return Extent.of(self.lengths)
-
-    @property
-    def time_rounding(self) -> Scalar | None:
-        """Bound of the relative timing error of parts through rounding of times [s]; None: `lengths` are exact."""
-        return None
-
-    @property
-    def following(self) -> Int[Array, " knots"] | None:
-        """For each piece, and for the end, the first piece from there on that has a length; None: few or none to
-        skip.
-        """
-        return None
-
-    @property
-    @abc.abstractmethod
-    def scales(self) -> Inexact[Array, " pieces"] | None:
-        """Time scale of the acceleration in each piece [s]; infinite for a straight line. None: all are straight."""
-
-    @property
-    @abc.abstractmethod
-    def bounds(self) -> Inexact[Array, " pieces"]:
-        """An upper bound of the absolute acceleration within each piece [g]."""
-
-    @abc.abstractmethod
-    def series(self, piece: Piece, local: Scalar, unit: Scalar, order: int) -> list[Scalar]:
-        """Taylor coefficients of the acceleration [g] about `local` seconds after knot `piece`.
-
-        Coefficient k multiplies (elapsed time / unit)^k. A motion that is a polynomial returns
-        fewer than order + 1 coefficients: the others are zero.
-        """
-
-    @property
-    def vertical_bounds(self) -> Inexact[Array, " pieces"] | None:
-        """An upper bound of the absolute vertical acceleration within each piece [g]; None: the ground has none."""
-        return None
-
-    def vertical_series(self, piece: Piece, local: Scalar, unit: Scalar, order: int) -> list[Scalar] | None:
-        """Return the Taylor coefficients of the vertical acceleration, positive upward [g], as `series` does."""
-        return None
-
-    @property
-    def envelope(self) -> Envelope:
-        """Bounds of the horizontal and of the vertical acceleration."""
-        vertical = self.vertical_bounds
-        return Envelope(Bounds(self.bounds), None if vertical is None else Bounds(vertical))
-
-    @property
-    def end(self) -> Scalar:
-        """Time at which the ground comes to rest [s]."""
-        return of_each(lambda knots: knots[-1], self.knots)
+    def prepared(self) -> "AbstractMotion":
+        """This motion, in which sums hold what all steps of a scene need."""
+        return jax.tree.map(_with_merged, self, is_leaf=lambda node: type(node) is Summed)
 
     @arguments
     def acceleration(self, time: Values) -> Inexact[Array, "..."]:
@@ -125,6 +64,11 @@ class AbstractMotion(Owner):
     def shifted(self, delay: ArrayLike, *, throw: bool = True) -> "Shifted":
         """Return this motion after `delay` seconds of quiet (0 or more)."""
         return Shifted(self, delay)
+
+    @with_throw
+    def from_time(self, start: ArrayLike, *, throw: bool = True) -> "FromTime":
+        """Return the rest of this motion, from `start` seconds (0 or more) on."""
+        return FromTime(self, start)
 
     def __mul__(self, factor: ArrayLike) -> "Scaled":
         return Scaled(self, factor)
@@ -169,37 +113,10 @@ class _Changed(AbstractMotion):
         return None if vertical is None else vertical.times_gain(vertical.values)
 
 
-class AtTheSameTimes(_Changed):
+class AtTheSameTimes(SamePieces, _Changed):
     """A motion made of one other, with the same pieces."""
 
     motion: AbstractMotion
-
-    @property
-    def knots(self) -> Inexact[Array, " knots"]:
-        return self.motion.knots
-
-    @property
-    def lengths(self) -> Inexact[Array, " pieces"]:
-        return self.motion.lengths
-
-    def length(self, piece: Piece) -> Scalar:
-        return self.motion.length(piece)
-
-    @property
-    def lasting(self) -> Extent:
-        return self.motion.lasting
-
-    @property
-    def time_rounding(self) -> Scalar | None:
-        return self.motion.time_rounding
-
-    @property
-    def following(self) -> Int[Array, " knots"] | None:
-        return self.motion.following
-
-    @property
-    def scales(self) -> Inexact[Array, " pieces"] | None:
-        return self.motion.scales
 
 
 class Scaled(AtTheSameTimes):
@@ -246,6 +163,10 @@ class Shifted(_Changed):
         return jnp.concatenate([jnp.zeros_like(knots[:1]), knots])
 
     @property
+    def first_quiet(self) -> int:
+        return 1 + self.motion.first_quiet
+
+    @property
     def lengths(self) -> Inexact[Array, " pieces"]:
         inner = self.motion.lengths
         return jnp.concatenate([jnp.full_like(inner[:1], self.delay), inner])
@@ -287,76 +208,123 @@ class Shifted(_Changed):
         return None if inner is None else [select(piece > 0, v, 0.0) for v in inner]
 
 
+class FromTime(RestOfPieces, _Changed):
+    """A motion from `start` seconds on (`motion.from_time(start)`): pieces that are over have no length."""
+
+    motion: AbstractMotion
+    start: Inexact[Array, "..."] = parameter("s", delay)
+
+    @arguments
+    def __init__(self, motion: AbstractMotion, start: ArrayLike):
+        self.motion = motion
+        set_parameters(self, start=start)
+        if type(motion) is FromTime:
+            self.motion, self.start = motion.motion, motion.start + self.start
+
+
 class _Together(AbstractMotion):
-    """Two motions at once, on merged pieces."""
+    """Several motions at once, on merged pieces."""
 
     @property
     @abc.abstractmethod
-    def _both(self) -> tuple[AbstractMotion, AbstractMotion]:
-        """The two motions."""
+    def _together(self) -> tuple[AbstractMotion, ...]:
+        """The motions."""
 
     @property
-    def _finer(self) -> MergedKnots:
-        first, second = self._both
-        return MergedKnots(first.knots, second.knots)
+    def _pieces(self) -> MergedPair | MergedParts:
+        return MergedPair(*self._together)
 
     @property
     def knots(self) -> Inexact[Array, " knots"]:
-        return self._finer.knots
+        return self._pieces.knots
 
     @property
     def time_rounding(self) -> Scalar | None:
         # The times of a shifted part are rounded like those of the whole sum.
-        parts, knots = jax.tree.leaves(self._both, is_leaf=lambda node: isinstance(node, Shifted)), self.knots
+        parts, knots = jax.tree.leaves(self._together, is_leaf=lambda node: isinstance(node, Shifted)), self.knots
         if not any(isinstance(part, Shifted) for part in parts):
             return None
-        own = (motion.time_rounding for motion in self._both)
+        own = (motion.time_rounding for motion in self._together)
         return sum((late for late in own if late is not None), jnp.finfo(knots.dtype).eps * knots[-1])
 
     @property
     def following(self) -> Int[Array, " knots"] | None:
-        return self._finer.following
+        return self._pieces.following
 
     @property
     def scales(self) -> Inexact[Array, " pieces"] | None:
-        spread = self._finer.spread(*(motion.scales for motion in self._both), quiet=jnp.inf)
-        found = [values for values in spread if values is not None]
-        return functools.reduce(jnp.minimum, found) if found else None
+        return self._pieces.scales
 
 
 class Summed(_Together):
-    """The sum of two motions (`motion + motion`)."""
+    """The sum of motions (`motion + motion`, `sum(motions)`): the parts of sums within it are its own parts."""
 
-    first: AbstractMotion
-    second: AbstractMotion
+    parts: tuple[AbstractMotion, ...]
+    merged: MergedParts | None  # computed once for all steps of a scene: see `prepared`; None: where it is needed
 
     @arguments
     def __init__(self, first: AbstractMotion, second: AbstractMotion):
-        self.first, self.second = first, second
+        parts = (motion.parts if type(motion) is Summed else (motion,) for motion in (first, second))
+        self.parts, self.merged = tuple(itertools.chain(*parts)), None
 
     @property
-    def _both(self) -> tuple[AbstractMotion, AbstractMotion]:
-        return self.first, self.second
+    def first(self) -> AbstractMotion:
+        """The sum of all parts but the last."""
+        *parts, _ = self.parts
+        return functools.reduce(Summed, parts)
+
+    @property
+    def second(self) -> AbstractMotion:
+        """The last part."""
+        return self.parts[-1]
+
+    def parameter_path(self, path: tuple[str, ...]) -> tuple[str, ...]:
+        """Return the path that names a parameter: `first` and `second`, of three `first.first` to `second`."""
+        names: dict[int, tuple] = {
+            2: (("first",), ("second",)),
+            3: (("first", "first"), ("first", "second"), ("second",)),
+        }
+        field, *rest = path
+        if field != "parts" or len(self.parts) not in names:
+            return path
+        return *names[len(self.parts)][int(rest[0])], *rest[1:]
+
+    @property
+    def _together(self) -> tuple[AbstractMotion, ...]:
+        return self.parts
+
+    @property
+    def _pieces(self) -> MergedPair | MergedParts:
+        if self.merged is not None:
+            return self.merged
+        return MergedPair(*self.parts) if len(self.parts) == 2 else MergedParts.of(self.parts)
+
+    @property
+    def lasting(self) -> Extent:
+        return self._pieces.lasting
 
     @property
     def bounds(self) -> Inexact[Array, " pieces"]:
-        # Values are spread before the gain applies, so that lanes with different gains share the spread array.
-        both = self._finer.spread_bounds(*(motion.envelope.horizontal for motion in self._both))
-        return functools.reduce(jnp.add, (bounds.times_gain(bounds.values) for bounds in both))
+        return self._pieces.bounds
 
     def series(self, piece: Piece, local: Scalar, unit: Scalar, order: int) -> list[Scalar]:
-        both = (motion.series for motion in self._both)
-        return sum_of_series(*self._finer.series(*both, piece=piece, local=local, unit=unit, order=order)) or []
+        return self._pieces.series("series", piece, local, unit, order) or []
 
     @property
     def vertical_bounds(self) -> Inexact[Array, " pieces"] | None:
-        spread = self._finer.spread(*(motion.vertical_bounds for motion in self._both), quiet=0.0)
-        found = [bounds for bounds in spread if bounds is not None]
-        return functools.reduce(jnp.add, found) if found else None
+        return self._pieces.vertical_bounds
 
     def vertical_series(self, piece: Piece, local: Scalar, unit: Scalar, order: int) -> list[Scalar] | None:
-        both = (motion.vertical_series for motion in self._both)
-        return sum_of_series(*self._finer.series(*both, piece=piece, local=local, unit=unit, order=order))
+        return self._pieces.series("vertical_series", piece, local, unit, order)
+
+
+def _with_merged(part: Any) -> Any:
+    """Return a sum with its merged pieces; of two, these are computed anyway where they are needed."""
+    if type(part) is not Summed or part.merged is not None:
+        return part
+    parts = tuple(each.prepared for each in part.parts)
+    merged = MergedParts.of(parts) if len(parts) > 2 else None
+    return eqx.tree_at(lambda s: (s.parts, s.merged), part, (parts, merged), is_leaf=lambda x: x is None)
 
 
 class WithVertical(_Changed, _Together):
@@ -379,12 +347,16 @@ class WithVertical(_Changed, _Together):
         self.horizontal, self.vertical = horizontal, vertical
 
     @property
-    def _both(self) -> tuple[AbstractMotion, AbstractMotion]:
+    def _together(self) -> tuple[AbstractMotion, ...]:
         return self.horizontal, self.vertical
 
     @property
+    def _finer(self) -> MergedKnots:
+        return MergedPair(*self._together).finer
+
+    @property
     def envelope(self) -> Envelope:
-        return Envelope(*self._finer.spread_bounds(*(motion.envelope.horizontal for motion in self._both)))
+        return Envelope(*self._finer.spread_bounds(*(motion.envelope.horizontal for motion in self._together)))
 
     def series(self, piece: Piece, local: Scalar, unit: Scalar, order: int) -> list[Scalar]:
         found = self._finer.series(self.horizontal.series, None, piece=piece, local=local, unit=unit, order=order)
@@ -398,3 +370,10 @@ def is_of_several(motion: AbstractMotion) -> bool:
     """Return whether a motion combines two motions or more."""
     parts = jax.tree.leaves(motion, is_leaf=lambda node: isinstance(node, _Together))
     return any(isinstance(part, _Together) for part in parts)
+
+
+def merged_pieces(motion: AbstractMotion) -> int:
+    """Return how many pieces sums of more than two parts have beyond those of their longest part."""
+    parts = jax.tree.leaves(motion, is_leaf=lambda node: type(node) is Summed)
+    merged = (part.merged for part in parts if type(part) is Summed)
+    return sum(each.knots.size - 1 - each.longest for each in merged if each is not None)

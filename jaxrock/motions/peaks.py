@@ -13,6 +13,7 @@ from jaxrock._core.types import Scalar
 from jaxrock.blocks.rigid import GRAVITY
 from jaxrock.compiler import checks
 from jaxrock.compiler.hints import jit_low_effort
+from jaxrock.motions.floors import with_solved_floors
 from jaxrock.motions.motion import AbstractMotion
 from jaxrock.motions.record import with_room
 from jaxrock.numerics.gauss_legendre import gauss_legendre
@@ -86,6 +87,7 @@ def _peaks_of(motion: AbstractMotion, room: int | None):
     quadrature integrates the acceleration over each part, and up to its zero in the part. Newton's method finds the
     extremum of the acceleration near the larger end of each part.
     """
+    motion = with_solved_floors(motion)
     kind = motion.knots.dtype
     nodes, weights = (jnp.asarray(values, kind) / 2 for values in (_NODES, _WEIGHTS))
     lengths = motion.lengths

@@ -56,6 +56,7 @@ def acceleration_at(motion: Any, time: Inexact[Array, "..."]) -> Inexact[Array, 
     """Return the acceleration of a motion [g] at times from its start [s]: zero outside, at a jump the value after
     it.
     """
+    motion = motion.prepared
     knots = motion.knots
 
     def at(t):

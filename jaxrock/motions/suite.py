@@ -24,6 +24,7 @@ from jaxrock._core.precision import frames_of_the_package
 from jaxrock._core.settings import called_by_users
 from jaxrock.compiler import checks
 from jaxrock.motions.components import Components
+from jaxrock.motions.floors import Floor
 from jaxrock.motions.joined_records import Chosen, JoinedRecords
 from jaxrock.motions.motion import AbstractMotion, Scaled, Shifted, WithVertical
 from jaxrock.motions.peaks import peaks_of_many, peaks_of_motion
@@ -232,7 +233,7 @@ def size_of(group: AbstractMotion) -> int:
 
 def _names(motion: AbstractMotion, size: int) -> list[str]:
     inner = motion
-    while not getattr(inner, "name", "") and isinstance(inner, Scaled | Shifted | WithVertical):
+    while not getattr(inner, "name", "") and isinstance(inner, Floor | Scaled | Shifted | WithVertical):
         inner = inner.horizontal if isinstance(inner, WithVertical) else inner.motion
     name = getattr(inner, "name", "") or type(motion).__name__
     return [name] if size == 1 else [f"{name} {k + 1}" for k in range(size)]

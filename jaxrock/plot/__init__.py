@@ -20,6 +20,10 @@ from jaxrock.plot.sensitivities import (
     tornado as tornado,
 )
 from jaxrock.plot.spectra import spectrum as spectrum
+from jaxrock.plot.stroboscopic import (
+    basins_of_attraction as basins_of_attraction,
+    bifurcation_diagram as bifurcation_diagram,
+)
 from jaxrock.plot.style import broken_curve as broken_curve, log_ticks as log_ticks
 from jaxrock.plot.surfaces import borders as borders, overturning as overturning
 

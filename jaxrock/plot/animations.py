@@ -129,7 +129,7 @@ class _Parts:
         left, right, high = _room(body, rotation)
         scene.set(xlim=(1.1 * left, 1.1 * right), ylim=(-0.25 * size, 1.1 * high), aspect="equal")
         scene.set_axis_off()
-        draw_ground(scene, body)
+        draw_ground(scene, body, None if isinstance(response, FlexibleResponse) else response.scene.only_side)
         self.outline, self.column, self.masses = draw(scene, body, body.pose(0.0))
         (self.flash,) = scene.plot([], [], "*", color=RED, markersize=16, zorder=5)
         self.verdict = textwrap.fill(why_not(response.status) or ("overturns" if response.overturned else "stands"), 42)

@@ -10,6 +10,7 @@ from jaxrock._arguments.ranges import Range, scalar, strength
 from jaxrock.blocks.asymmetric import AsymmetricBlock
 from jaxrock.blocks.cantilever import unit_column
 from jaxrock.blocks.flexible import FlexibleBlock
+from jaxrock.blocks.rigid import Block
 from jaxrock.models.equation import AbstractEquation
 from jaxrock.models.rigid import Housner
 from jaxrock.models.spring import Spring
@@ -43,7 +44,7 @@ def scene(
 
     Corner O is that of positive rotations; the ground's acceleration is positive to the right. A block defined by
     slenderness and frequency alone is drawn as the rectangle of that p. An asymmetric one is drawn as the parallelogram
-    with its corners and its centre of mass.
+    with its corners and its centre of mass. What stands behind a wall that opens to one side is drawn hatched.
 
     **Arguments:**
 
@@ -74,7 +75,7 @@ def scene(
         shape = unit_column(block.masses).shapes[:, 0]
         column = bent * np.concatenate([[0.0], shape / shape[-1]])
     shapes = body.pose(rotation, column)
-    draw_ground(axis, body)
+    draw_ground(axis, body, block.only_side if isinstance(block, Block) else None)
     draw(axis, body, shapes)
     if isinstance(block, AsymmetricBlock):
         _sides(axis, body, rotation)
@@ -102,8 +103,8 @@ def _axis_over(motion: AbstractMotion | None) -> "Axes":
     return axis
 
 
-def draw_ground(axis: "Axes", body: Body) -> None:
-    """Draw the ground with its hatching."""
+def draw_ground(axis: "Axes", body: Body, only_side: int | None = None) -> None:
+    """Draw the ground with its hatching, and what stands behind a wall that opens to one side."""
     from matplotlib.patches import Polygon
 
     size, (right, left) = body.size, (body.right, body.left)
@@ -112,6 +113,12 @@ def draw_ground(axis: "Axes", body: Body) -> None:
     axis.add_patch(Polygon([*surface, [3 * size, depth], [-3 * size, depth]], facecolor="white", edgecolor=GREY,
                            hatch="////", linewidth=0))  # fmt: skip
     axis.plot(*np.transpose(surface), **_INK)
+    if only_side is not None:
+        face, high = (left if only_side > 0 else right)[0], body.outline[:, 1].max()
+        back = face + only_side * depth
+        behind = [[face, 0.0], [face, high], [back, high], [back, 0.0]]
+        axis.add_patch(Polygon(behind, facecolor="white", edgecolor=GREY, hatch="////", linewidth=0, zorder=0.5))
+        axis.plot([face, face], [0.0, high], **_INK, zorder=0.6)
 
 
 def draw(axis: "Axes", body: Body, shapes: Shapes) -> "tuple[Polygon, Line2D, Line2D]":

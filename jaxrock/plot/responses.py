@@ -127,7 +127,7 @@ def history(response: Response | FlexibleResponse, axes: "Sequence[Axes] | None"
     - `axes`: three matplotlib axes; None makes a figure.
 
     **Returns:** the three axes. For an asymmetric block alpha is the smaller slenderness angle, and each direction has
-    its own threshold.
+    its own threshold. A wall that opens to one side has one threshold.
 
     **Raises:** ValueError for the response of many scenes.
     """
@@ -155,7 +155,9 @@ def history(response: Response | FlexibleResponse, axes: "Sequence[Axes] | None"
     if vertical is not None:
         axes[2].plot(shaken, vertical, color=GREY, linewidth=0.6, label="vertical")
     for side, moments in zip((1, -1), scene.both_moments):  # positive acceleration lifts it to side -1
-        label, level = "uplift threshold" if side > 0 else None, -side * float(moments.threshold)
+        if scene.only_side not in (None, side):
+            continue
+        label, level = "uplift threshold" if side > 0 or scene.only_side else None, -side * float(moments.threshold)
         if vertical is None:
             axes[2].axhline(level, color=SAND, linewidth=0.9, label=label)
         else:  # upward acceleration adds to gravity, and raises the threshold

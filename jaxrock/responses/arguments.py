@@ -42,12 +42,19 @@ def engine_of(engine: AbstractEngine | None, model: AbstractEquation, motion: Ab
     return Diffrax(rtol=1e-10) if POLICY.is_record(motion.knots.size - 1) else Diffrax()
 
 
-def start_of(initial: tuple[ArrayLike, ArrayLike], throw: bool = True) -> tuple[Scalar, Scalar]:
-    """Check initial rotation and angular velocity; without `throw`, invalid values become NaN."""
+def start_of(
+    initial: tuple[ArrayLike, ArrayLike], throw: bool = True, block: AnyBlock | None = None
+) -> tuple[Scalar, Scalar]:
+    """Check initial rotation and angular velocity; without `throw`, invalid values become NaN.
+
+    A `block` that opens to one side starts at rest or on that side.
+    """
     if all(isinstance(x, float) and x == 0 for x in initial):
         return _at_rest(jnp.result_type(float))
     with throwing(throw):
-        return _start_of(initial)
+        start = _start_of(initial)
+        side = block.only_side if isinstance(block, Block) else None
+        return start if side is None else _on_side(start, side)
 
 
 _usual: dict[np.dtype, tuple[Scalar, Scalar]] = {}
@@ -72,6 +79,15 @@ def _start_of(initial: tuple[ArrayLike, ArrayLike]) -> tuple[Scalar, Scalar]:
     if not isinstance(velocity, jax.core.Tracer):  # a status reports traced values that are not finite
         velocity = strength("initial[1]", velocity)
     return scalar("initial[0]", rotation), scalar("initial[1]", velocity)
+
+
+def _on_side(start: tuple[Scalar, Scalar], side: int) -> tuple[Scalar, Scalar]:
+    rotation, velocity = start
+    allowed, way = f"be {'0 or more' if side > 0 else '0 or less'}, as the wall opens to that side", float(side)
+    rotation = checked("initial[0]", rotation, allowed, lambda x: ~(way * x < 0))
+    if not is_traced(start) and float(np.asarray(rotation)) == 0:  # a status reports traced values
+        velocity = checked("initial[1]", velocity, f"{allowed}, where it stands", lambda x: ~(way * x < 0))
+    return rotation, velocity
 
 
 def steps_of_flexible(

@@ -76,25 +76,44 @@ def contact_forces(
 ) -> Contact:
     """Compute the forces between block and ground along a response.
 
+    Of a frame they are the sums under all columns, over its whole weight. One column may need more friction, and the
+    beam slide on the columns before.
+
     **Arguments:**
 
-    - `response`: of `simulate`, of one scene.
+    - `response`: of `simulate` with `Housner()`, `Linear()` or `Rolling(...)`, of one scene.
     - `block`: that of the response.
     - `inertia_ratio`: m R^2/I about a corner [-], in (0, 1], of a symmetric `Block`. None: that of its `Rolling`, or
       that of its law of restitution (of a block made with an inertia ratio), or 3/4, a rectangle's. An
-      `AsymmetricBlock` has its own.
+      `AsymmetricBlock` has its own, and a frame the ratio that follows from its beam.
 
     **Returns:** a `Contact`.
 
-    **Raises:** ValueError for a value outside its range, or for another block or inertia ratio than that of the
-    response.
+    **Raises:** ValueError for a value outside its range, for another block or inertia ratio than that of the response,
+    for a wall that opens to one side, whose neighbour's forces are unknown, and for a response of another model: with a
+    spring, a restraint, or an equation of your own, the forces do not follow from the rotation alone. A class of models
+    for which they do says so by `forces_follow`.
 
     **Source:** momentum of the centre of mass, on a circle about the corner, or as it rolls (Shenton 1996 for the
     beginning of rocking); at an impact, of the impulse that angular momentum about the new corner implies.
     """
     check_single(block=block)
     response.trajectory.check_single()
+    if response.scene.only_side is not None:
+        raise ValueError(
+            "Argument `response` must not be of a wall that opens to one side: what stands behind it bears an unknown "
+            "part of its forces."
+        )
+    if not response.scene.forces_follow:
+        raise ValueError(
+            "Argument `response` must be one with `Housner()`, `Linear()` or `Rolling(...)`, whose forces between "
+            "block and ground follow from the rotation. With a `Spring`, restraints, a `Mechanism` or an equation of "
+            "your own, they do not: compute them from the momentum of your bodies."
+        )
     check_own(response.scene, block)
+    if response.scene.is_frame != (isinstance(block, Block) and block.beam is not None):
+        words = ("a frame", "one body") if response.scene.is_frame else ("one body", "a frame")
+        raise ValueError(f"Argument `block` must be that of the response, which is {words[0]}, but is {words[1]}.")
     ratio = scalar("inertia_ratio", ratio_of_inertia("inertia_ratio", _ratio_of(response.scene, block, inertia_ratio)))
     return _contact(response, block, ratio)
 
@@ -102,12 +121,15 @@ def contact_forces(
 def _ratio_of(scene: Scene, block: Block | AsymmetricBlock, given: ArrayLike | None) -> ArrayLike:
     """Return the inertia ratio that is given, or known for a symmetric block."""
     moments = scene.moments
-    own = moments.ratio if isinstance(moments, RollingMoments) and isinstance(block, Block) else None
+    own, of = None, "`Rolling`"
+    if isinstance(block, Block):
+        own = moments.ratio if isinstance(moments, RollingMoments) else block.base_ratio
+        of = of if block.beam is None else "frame"
     if given is None:
         known = block.law.inertia_ratio if isinstance(block.law, Housner) else None
         return own if own is not None else 0.75 if known is None else known
     if own is not None and not is_traced((own, given)) and not np.allclose(own, given, rtol=1e-5, atol=0):
-        raise ValueError(f"Argument `inertia_ratio` must be {own:.6g} as that of the `Rolling`, but is {shown(given)}.")
+        raise ValueError(f"Argument `inertia_ratio` must be {own:.6g} as that of the {of}, but is {shown(given)}.")
     return given
 
 

@@ -8,15 +8,16 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
-from jaxrock._arguments.parameters import is_ours
+from jaxrock._arguments.parameters import check_single, is_ours
 from jaxrock._core.arrays import is_traced
 from jaxrock._core.throwing import throwing
 from jaxrock.blocks.asymmetric import AsymmetricBlock
 from jaxrock.blocks.rigid import Block, Side
-from jaxrock.compiler import checks, trace_function
+from jaxrock.compiler import checks
 from jaxrock.engines.stepper import AbstractEngine
 from jaxrock.engines.taylor.accurate import Series
-from jaxrock.models.equation import AbstractEquation, Angle
+from jaxrock.models.equation import AbstractEquation, AbstractMoments, Angle
+from jaxrock.models.mechanism import Mechanism
 from jaxrock.models.spring import Spring
 from jaxrock.models.user_equation import Equation, Functions
 
@@ -40,13 +41,10 @@ def current_model(model: AbstractEquation, block: Block | AsymmetricBlock, *scen
     kind = Side if isinstance(block, AsymmetricBlock) else Block
     dtype = jnp.result_type(*jax.tree.leaves((block, scene)))
     dtype = dtype if jnp.issubdtype(dtype, jnp.inexact) else jnp.result_type(float)
-    number = jax.ShapeDtypeStruct((), dtype)
-    example = jax.tree.map(lambda leaf: number, _example(kind))
-
-    def current(node):
-        return trace_function(node, number, number, number, example) if _is_functions(node) else node
-
-    return jax.tree.map(current, model, is_leaf=_is_functions)
+    example = _example(kind, block.opens if isinstance(block, Block) else None)
+    return jax.tree.map(
+        lambda node: node.current(dtype, example) if _is_functions(node) else node, model, is_leaf=_is_functions
+    )
 
 
 def standing(
@@ -54,24 +52,23 @@ def standing(
 ) -> Block | AsymmetricBlock:
     """Return the block, with checks that the model has a balance for it.
 
-    Checked are an `Equation` (of `current_model`) at rest, a block on a spring, and a user's own model that `engine`
-    solves by its balance. Without `throw`, a block that fails becomes NaN.
+    Checked are an `Equation` or a `Mechanism` (of `current_model`) at rest, a block on a spring, and a user's own model
+    that `engine` solves by its balance. Without `throw`, a block that fails becomes NaN.
 
     The checks are here and not in the engines, so that compiled engines contain no host callbacks, and JAX can cache
     them.
     """
+    check_single(model=model)
     if isinstance(model, Spring):
         return _balanced(block, model, throw)
-    if not isinstance(model, Equation) and (is_ours(model) or not isinstance(engine, Series)):
+    if not isinstance(model, Equation | Mechanism) and (is_ours(model) or not isinstance(engine, Series)):
         return block
-    for side in (block,) if isinstance(block, Block) else block.sides:
-        # For concrete values: one call, not fifty. For traced ones, checks within the functions belong to this trace.
-        found = _faults(model, side) if is_traced((model, side)) else _compiled_faults(model, side)
-        if not throw:
-            block = _none_where(jnp.stack(list(found.values())).any(), block)
-            continue
-        for message, applies in found.items():
-            block = checks.error_if(block, applies, message, collectable=False)
+    # For concrete values: one call, not fifty. For traced ones, checks within the functions belong to this trace.
+    found = _faults(model, block) if is_traced((model, block)) else _compiled_faults(model, block)
+    if not throw:
+        return _none_where(jnp.stack(list(found.values())).any(), block)
+    for message, applies in found.items():
+        block = checks.error_if(block, applies, message, collectable=False)
     return block
 
 
@@ -94,13 +91,20 @@ def _balanced(block: Block | AsymmetricBlock, spring: Spring, throw: bool) -> Bl
     return block
 
 
-def _faults(model: AbstractEquation, block: Block | Side) -> dict[str, Bool[Array, ""]]:
-    if isinstance(model, Equation):
-        return {message: jnp.any(applies) for message, applies in model.faults(block).items()}
-    moments = model.moments(block)
+def _faults(model: AbstractEquation, block: Block | AsymmetricBlock) -> dict[str, Bool[Array, ""]]:
+    """Return messages, each with whether its fault occurs on a side of the block."""
+    if isinstance(model, Equation | Mechanism):
+        found = [model.faults(side) for side in ((block,) if isinstance(block, Block) else block.sides)]
+    else:
+        sides = (model.moments(block),) if isinstance(block, Block) else model.moments_of_sides(block)
+        found = [_unbalanced(moments) for moments in sides]
+    return {message: jnp.any(jnp.stack([jnp.any(each[message]) for each in found])) for message in found[0]}
+
+
+def _unbalanced(moments: AbstractMoments) -> dict[str, Bool[Array, "..."]]:
     saddle, flat = moments.saddle, Angle.of(jnp.full_like(moments.saddle, jnp.pi / 2))
     rights = (saddle < jnp.pi / 2) & (moments.restoring(flat) > 0)
-    return {_NO_BALANCE: ~jnp.all((saddle > 0) & (saddle < jnp.inf)), _RIGHTS_AGAIN: jnp.any(rights)}
+    return {_NO_BALANCE: ~((saddle > 0) & (saddle < jnp.inf)), _RIGHTS_AGAIN: rights}
 
 
 _NO_BALANCE = (
@@ -117,15 +121,16 @@ _compiled_faults = jax.jit(_faults)
 
 
 def _is_functions(node) -> bool:
-    return isinstance(node, Functions)
+    return isinstance(node, Functions) and not node.is_current
 
 
 @functools.cache
-def _example(kind: type) -> Block | Side:
+def _example(kind: type, opens: str | None) -> Block | Side:
     """Return a block of this kind, in the form that `as_functions_see` gives."""
 
     def made():
         with checks.collect():
-            return kind(*(jnp.asarray(x) for x in (0.2, 1.0, 0.9)))
+            numbers = (jnp.asarray(x) for x in (0.2, 1.0, 0.9))
+            return kind(*numbers) if opens is None else kind(*numbers, opens=opens)
 
     return jax.eval_shape(made)

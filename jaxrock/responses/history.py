@@ -254,7 +254,7 @@ def simulate(
     say_if_single()
     model = current_model(model, block, motion)
     engine = engine_of(engine, model, motion)
-    given = block, motion, model, start_of(initial, throw), duration
+    given = block, motion, model, start_of(initial, throw, block), duration
     block, motion, model, start, duration = given if throw else still_if_none(given)
     given = standing(block, model, engine, throw), padded(motion), model, start, duration
     block, motion, model, start, duration = given if throw else still_if_none(given)

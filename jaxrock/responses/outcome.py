@@ -65,7 +65,8 @@ class Outcome(AbstractTable):
     The margin is the smallest squared distance from standing still in balance (Voyagaki et al. 2012, 3.11), (velocity/p
     sin alpha)^2 + (acceleration/p^2 sin alpha)^2, over turning points and crossings of the unstable equilibrium. The
     acceleration is that with or without the shaking, whichever is larger. If the block overturned, the margin is the
-    negative distance over those since the last outward crossing.
+    negative distance over those since the last outward crossing. Where the restoring moment of an equation of your own
+    or a rounded edge rises at first, its changes up to the balance, rises and falls, stand for the acceleration.
 
     It is at most 1, except for a block that never uplifts: 2 - bound of the acceleration/threshold. In a free linear
     stage it is 1 - E/E_crit. (In the linear model alpha stands for sin alpha.)
@@ -140,12 +141,13 @@ def outcome(
 
     - `block`: a `Block`, `AsymmetricBlock` or `FlexibleBlock` of scalars (use `jax.vmap` for many).
     - `motion`: any motion, with a vertical one if it has one (`with_vertical`); the ground rests after its end.
-    - `model`: `Housner()` (nonlinear), `Linear()`, a `Spring(...)`, an `Equation` or `AbstractEquation` of your own.
+    - `model`: `Housner()` (nonlinear), `Linear()`, a `Spring(...)`, a `Mechanism(...)` with its own block, an
+      `Equation` or `AbstractEquation` of your own.
     - `initial`: rotation [rad] and angular velocity [rad/s] at time 0.
     - `duration`: time for which to follow a `FlexibleBlock` [s], positive; None: the motion and 10/p of free rocking. A
       rigid block is followed to its end.
-    - `engine`: `Series(...)` or `Diffrax(...)`; None takes `Series()`, for an `Equation` or `Rolling` `Diffrax()`, of
-      tolerance 1e-10 under a record.
+    - `engine`: `Series(...)` or `Diffrax(...)`; None takes `Series()`, for an `Equation`, `Mechanism` or `Rolling`
+      `Diffrax()`, of tolerance 1e-10 under a record.
     - `throw`: whether a number outside of its range raises. False, for trial steps of optimisers: the outcome is NaN,
       its derivatives are zero, and its status is `Status.not_finite`. Make block and motion with `throw=False`, too.
 
@@ -163,7 +165,7 @@ def outcome(
         )
     say_if_single()
     model, engine = current_model(model, block, motion), engine_of(engine, model, motion)
-    given = *in_real_numbers(block, motion), model, start_of(initial, throw)
+    given = *in_real_numbers(block, motion), model, start_of(initial, throw, block)
     block, motion, model, start = given if throw else still_if_none(given)
     block = standing(block, model, engine, throw)
     in_place = isinstance(engine, Series) and is_in_place(motion)
@@ -197,7 +199,7 @@ def _in_reverse(scene) -> Outcome:
     *given, engine = scene
     taped = not engine.reverse
     stepper, state = _begun(scene, functools.partial(engine.stepper, taped=taped))
-    state = stepper.end_on_tape(state) if taped else stepper.to_the_end(all_moving(state, stepper.scene))
+    state = stepper.end_on_tape(stepper.begun(state)) if taped else stepper.to_the_end(all_moving(state, stepper.scene))
     found = _outcome_of(conclude(stepper, state))
 
     def with_copies():
@@ -238,7 +240,7 @@ class _OutcomePasses(TwoPass):
         scene = Scene.of(block, motion, model, in_place=True)
         stepper = engine.stepper(scene, None, history=False)
         state = initial_state(scene, *(jnp.asarray(x, scene.p.dtype) for x in initial))
-        return stepper, all_moving(state, scene)
+        return stepper, stepper.begun(all_moving(state, scene))
 
     def fast(self, point, state, limit):
         return fast_loop(point, state, limit)
@@ -247,7 +249,7 @@ class _OutcomePasses(TwoPass):
         return _outcome_of(conclude_with_copies(point, state))
 
     def unfinished(self, point, state):
-        return ~state.done & (state.steps < most_steps(point.scene.most_pieces))
+        return ~state.done & (state.steps < most_steps(point.scene))
 
     def result(self, point, state):
         result = _outcome_of(conclude(point, state))

@@ -23,14 +23,16 @@ def check_own(scene: Scene, block: Block | AsymmetricBlock) -> None:
     if is_traced((scene, block)):
         return
     if isinstance(block, Block):
-        angles, rate, differ = [block.alpha] * 2, block.p, tells_sides(block.law, block.corners)
+        differ = block.opens is None and tells_sides(block.law, block.corners)
+        angles, rate, opens = [block.alpha] * 2, block.p, block.only_side or 0
     else:
-        angles, rate, differ = [block.alpha1, block.alpha2], block.p1, True
+        angles, rate, differ, opens = [block.alpha1, block.alpha2], block.p1, True, 0
     rtol = 1e-5 if np.asarray(scene.alpha).dtype.itemsize < 8 else 1e-9
     checks: list[tuple[str, Any, Any]] = [
         ("alpha and p are {:.6g} rad and {:.6g} rad/s", [scene.alpha, scene.p], [np.min(angles), rate]),
         ("sides uplift at {:.6g} and {:.6g} g", *_uplifts(scene, angles, rtol)),
         ("law of restitution or shape tells {:d} sides apart", [2 * (scene.far is not None)], [2 * differ]),
+        ("only side is {:d} (0: both)", [scene.only_side or 0], [opens]),
         ("sides rock at frequencies of the ratio {:.6g}", *_rates(scene, block, angles)),
         (_SHARES, _shares(_resets_of(scene)), _shares(_resets_of(block))),
     ]
@@ -46,7 +48,10 @@ def _resets_of(owner: Scene | Block | AsymmetricBlock) -> tuple[Reset, Reset]:
     """Return the impacts that end stays on one side, and on the other."""
     if isinstance(owner, Scene):
         return owner.reset, owner.far_reset
-    one, other = on_sides(owner.law, owner.corners) if isinstance(owner, Block) else owner.corners
+    if isinstance(owner, Block):
+        one, other = on_sides(owner.law, owner.corners) if owner.opens is None else (owner.corners,) * 2
+    else:
+        one, other = owner.corners
     p, most = (owner.p, 1.0) if isinstance(owner, Block) else (owner.p1, np.inf)
     return Reset.of(owner.law, one, p, most), Reset.of(owner.law, other, p, most)
 

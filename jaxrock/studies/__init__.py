@@ -4,6 +4,10 @@ Imports `responses` and `sweeps`. Start with `spectra`.
 """
 
 from jaxrock._core.namespace import shown as _shown
+from jaxrock.studies.attractors import (
+    Basins as Basins,
+    basins as basins,
+)
 from jaxrock.studies.azimuths import (
     AzimuthOutcomes as AzimuthOutcomes,
     azimuth_outcomes as azimuth_outcomes,
@@ -18,6 +22,10 @@ from jaxrock.studies.critical import (
     critical_durations as critical_durations,
 )
 from jaxrock.studies.critical_ends import Critical as Critical
+from jaxrock.studies.period_doubling import (
+    Bifurcation as Bifurcation,
+    bifurcation as bifurcation,
+)
 from jaxrock.studies.sensitivities import (
     Sensitivity as Sensitivity,
     SensitivityMap as SensitivityMap,
@@ -33,6 +41,10 @@ from jaxrock.studies.spectra import (
     self_similar_spectrum as self_similar_spectrum,
 )
 from jaxrock.studies.spectrum import Spectrum as Spectrum
+from jaxrock.studies.stroboscopic import (
+    StroboscopicState as StroboscopicState,
+    stroboscopic_map as stroboscopic_map,
+)
 from jaxrock.sweeps.devices import use_cpu_devices as use_cpu_devices
 from jaxrock.sweeps.grid import Grid as Grid
 

@@ -116,7 +116,7 @@ def azimuth_outcomes(
     for index, angle in enumerate(angles):
         motion = components.in_plane(angle - first, vertical)
         lanes = jax.tree.map(lambda x, own, at=index: x[at] if own else np.full(scales.shape, x[at]), known, alike)
-        found.append(of_motion(with_room(motion), to_device(lanes), to_device(scales), model, engine))
+        found.append(of_motion(with_room(motion), to_device(lanes), to_device(scales), model, engine, {}))
         bar.add(scales.size)
     parts = Scenes(*(np.stack([np.asarray(x) for x in part]) for part in zip(*found)))
     return AzimuthOutcomes(angles, scales, blocks, parts.verdict, parts.rotation, parts.margin)

@@ -36,8 +36,9 @@ class Critical(AbstractTable):
       throws it flat; such an end has no derivatives here (NaN).
     - `complete`: whether every sampled point could be decided. If not, ends may be missing. Within 1e-8 of an end
       (relative) no point needs to be decided.
-    - `names`, `derivative`: (..., ends, parameters) of `value` by the other parameters of the scene. For critical
-      amplitudes the amplitude of the motion is left out: it only stands for the motion's size.
+    - `names`, `derivative`: (..., ends, parameters) of `value` by the other parameters of the scene, with names as in
+      `sensitivity`. For critical amplitudes the amplitude of the motion is left out: it only stands for the motion's
+      size.
     - `from_the_least`: whether the block already overturns at the least value that was sampled.
     - `scale`: `value` over that of the motion as it was given [-]: the factor on a record, on the amplitude of a pulse,
       or on the duration; infinite where padded. None for ends that were put together by hand.

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
-from jaxrock._arguments.parameters import broadcast, leaves_of, one_of_many
+from jaxrock._arguments.parameters import broadcast, check_single, leaves_of, one_of_many
 from jaxrock._core.arrays import is_traced, of_each, to_device
 from jaxrock.blocks.asymmetric import AsymmetricBlock
 from jaxrock.blocks.rigid import Block
@@ -38,6 +38,7 @@ class CriticalScenes(eqx.Module):
     @classmethod
     def of(cls, block: Block | AsymmetricBlock, motion: AbstractMotion, model: AbstractEquation) -> "CriticalScenes":
         """Broadcast all parameters against one another."""
+        check_single(model=model)
         both = block, motion
         shape = jnp.broadcast_shapes(*(jnp.shape(leaf.value) for leaf in leaves_of(both) if not leaf.is_shared))
         if len(shape) > 1:
@@ -68,10 +69,15 @@ def _facts(both: PyTree, model: AbstractEquation, size: int) -> tuple[Array, Arr
     return jax.vmap(one)(jnp.arange(size))
 
 
-def _names(both: PyTree) -> list[str]:
+def _names(both: PyTree, model: AbstractEquation) -> list[str]:
     """Names of the parameters of a scene, in the order of `named`, without computing the peak of a sum."""
-    found = []
-    jax.eval_shape(lambda both: found.extend(named(*one_of_many(both, 0))), both)
+    found: list[str] = []
+
+    def tell(both, model):
+        block, motion = one_of_many(both, 0)
+        found.extend(named(block, motion, model))
+
+    jax.eval_shape(tell, both, model)
     return found
 
 
@@ -86,8 +92,19 @@ def _at(z, index, scene):
 
 @cheap_per_point
 def _slopes(z, index, scene):
-    kind, both = scene
-    return kind.slopes(z, *one_of_many(both, index))
+    kind, both, peak = scene
+    return kind.slopes(z, *one_of_many(both, index), peak[index])
+
+
+@jit_low_effort(eqx.filter_jit)
+def _slopes_of_units(kind: AbstractVaried, both: PyTree, peak: Array) -> dict[str, Array]:
+    """Derivatives of the logarithms of the units of all scenes, whose peaks are costly: once, not at every end."""
+    few = 16
+
+    def one(index):
+        return kind.slopes_of_unit(*one_of_many(both, index), peak[index])
+
+    return jax.lax.map(one, jnp.arange(peak.size), batch_size=min(few, peak.size))
 
 
 def critical_ends(
@@ -110,7 +127,7 @@ def critical_ends(
             "Argument `max_ends` must be given where arguments are traced (jax.jit, jax.vmap, a derivative): the "
             "number of ends is not known before."
         )
-    names = tuple(filter(kind.keeps, _names(scenes.both)))
+    names = tuple(filter(kind.keeps, _names(scenes.both, kind.model)))
     wanted = names if derivatives is None and known or derivatives else ()
     rows = (
         _all(scenes, grid, kind, wanted, progress)
@@ -127,8 +144,8 @@ def critical_ends(
 def _all(scenes: CriticalScenes, grid, kind: AbstractVaried, names: tuple[str, ...], progress) -> dict:
     """Bracket all ends, polish and differentiate them, and sort them by scene."""
 
-    def run(function, z, index):
-        return known_surface(function, (z, index), (kind, scenes.both), "critical", progress, outer=False)
+    def run(function, z, index, *more):
+        return known_surface(function, (z, index), (kind, scenes.both, *more), "critical", progress, outer=False)
 
     def at(z, index):
         return run(_at, z, index)
@@ -147,8 +164,10 @@ def _all(scenes: CriticalScenes, grid, kind: AbstractVaried, names: tuple[str, .
     if names:
         derivative = np.zeros((0, len(names)))
         if order.size:
-            slopes = run(_slopes, ends["safe"], ends["index"])
-            derivative = np.stack([slopes[name] for name in names], axis=-1) * value[:, None]
+            slopes = run(_slopes, ends["safe"], ends["index"], scenes.amplitude)
+            own = jax.tree.map(np.asarray, _slopes_of_units(kind, scenes.both, scenes.amplitude))
+            derivative = np.stack([slopes[name] + own[name][ends["index"]] for name in names], axis=-1)
+            derivative *= value[:, None]
         rows["derivative"] = np.where(ends["balanced"][:, None], derivative, np.nan)
     count = np.bincount(ends["index"], minlength=grid.shape[0])
     place = np.arange(order.size) - np.repeat(np.cumsum(count) - count, count)
@@ -191,8 +210,10 @@ def _lowest_of_one(index, scene) -> dict:
     rows = {"value": value, "scale": scale, "intensity": amplitude / scenes.threshold[index]}
     rows |= {name: ends[name] for name in ("rising", "impacts", "balanced")}
     if wanted.names:
-        slopes = jax.vmap(lambda z: kind.slopes(z, block, motion))(safe)
-        derivative = jnp.stack([slopes[name] for name in wanted.names], axis=-1) * value[:, None]
+        peak = scenes.amplitude[index]
+        slopes = jax.vmap(lambda z: kind.slopes(z, block, motion, peak))(safe)
+        own = kind.slopes_of_unit(block, motion, peak)
+        derivative = jnp.stack([slopes[name] + own[name] for name in wanted.names], axis=-1) * value[:, None]
         rows["derivative"] = jnp.where(balanced[:, None], derivative, jnp.nan)
 
     def filled(name, values):

@@ -2,6 +2,7 @@
 
 import abc
 import operator
+from dataclasses import replace
 
 import equinox as eqx
 import jax
@@ -15,10 +16,11 @@ from jaxrock.blocks.rigid import Block
 from jaxrock.compiler.hints import jit_low_effort
 from jaxrock.engines.stepper import AbstractEngine
 from jaxrock.models.equation import AbstractEquation, Angle
+from jaxrock.models.mechanism import Mechanism
 from jaxrock.models.user_equation import Equation
 from jaxrock.responses.outcome import outcome
 from jaxrock.status import Status, is_decided
-from jaxrock.studies.parameters import named, rebuilt, scaled_motion
+from jaxrock.studies.parameters import amplitude_of, named, rebuilt, rebuilt_model, scaled_motion
 
 _NEAR = 1e-2  # margin of a scene that is near its balance
 
@@ -73,24 +75,29 @@ class AbstractVaried(eqx.Module):
         margin, is_open = known_margin(margin, result.status)
         return margin, slope, result.impact_count, is_open
 
-    def slopes(self, z, block, motion):
-        """Return derivatives of the logarithm of the critical value by the parameters."""
-        known = named(block, motion)
-        values = {name: jnp.asarray(value) for name, value in known.items() if self.keeps(name)}
-
-        def changed(values):
-            return rebuilt(block, motion, known | values, known["amplitude"])
+    def slopes(self, z, block, motion, peak):
+        """Return derivatives of the critical z by the parameters; `peak`: that of the motion [g]."""
+        known = named(block, motion, self.model, peak)
 
         def margin(z, values):
-            return self.margin(z, *changed(values))[0]
+            varied = replace(self, model=rebuilt_model(self.model, known | values))
+            return varied.margin(z, *rebuilt(block, motion, known | values, known["amplitude"]))[0]
+
+        by_z, by_values = jax.jacfwd(margin, argnums=(0, 1))(z, self._kept(known))
+        by_z = jnp.where(by_z == 0, jnp.nan, by_z)
+        return {name: -slope / by_z for name, slope in by_values.items()}
+
+    def slopes_of_unit(self, block, motion, peak):
+        """Return derivatives of the logarithm of `unit` by the parameters; `peak`: that of the motion [g]."""
+        known = named(block, motion, self.model, peak)
 
         def unit(values):
-            return jnp.log(self.unit(*changed(values)))
+            return jnp.log(self.unit(*rebuilt(block, motion, known | values, known["amplitude"])))
 
-        by_z, by_values = jax.jacfwd(margin, argnums=(0, 1))(z, values)
-        own = jax.jacfwd(unit)(values)
-        by_z = jnp.where(by_z == 0, jnp.nan, by_z)
-        return {name: own[name] - slope / by_z for name, slope in by_values.items()}
+        return jax.jacfwd(unit)(self._kept(known))
+
+    def _kept(self, known):
+        return {name: jnp.asarray(value) for name, value in known.items() if self.keeps(name)}
 
 
 class Amplitude(AbstractVaried):
@@ -102,7 +109,7 @@ class Amplitude(AbstractVaried):
 
     def unit(self, block, motion):
         """Return the amplitude of the motion [g], which the factor multiplies."""
-        return jnp.abs(named(block, motion)["amplitude"])
+        return jnp.abs(amplitude_of(motion))
 
     def units(self, both, amplitude):
         """Return the amplitudes of many scenes [g]."""
@@ -168,7 +175,7 @@ def check_sizeless(block: Block | AsymmetricBlock, model: AbstractEquation) -> N
     one, other = ([getattr(each, name) for name in names] for each in two)
     if not np.allclose(one, other, rtol=1e-9, atol=0, equal_nan=True):
         raise ValueError("Argument `block` must have a restitution that does not depend on its p.")
-    if is_ours(model) and not isinstance(model, Equation):
+    if is_ours(model) and not isinstance(model, Equation | Mechanism):
         return
     one, other = (_accelerations(model, each) for each in two)
     if not np.allclose(one, other, rtol=1e-9, atol=0, equal_nan=True):

@@ -24,8 +24,9 @@ from jaxrock.motions.pulses.exponential import ExponentialPulse
 from jaxrock.responses.current_model import current_model
 from jaxrock.responses.outcome import Outcome, outcome
 from jaxrock.status import Enumeration, Status, is_decided, item
-from jaxrock.studies.parameters import named, rebuilt
-from jaxrock.studies.spectra import axis, scaled_law
+from jaxrock.studies.any_size import BlockOfAnySize
+from jaxrock.studies.parameters import named, rebuilt, rebuilt_model
+from jaxrock.studies.spectra import axis
 from jaxrock.sweeps.runner import cheap_per_point
 from jaxrock.sweeps.sweep import surface
 
@@ -133,24 +134,27 @@ def sensitivity(
     - `block`, `motion`, `model`, `engine`: as in `outcome`; under `jax.vmap` for many scenes.
 
     **Returns:** a `Sensitivity`. Derivatives are partial. That by `alpha` includes a restitution that follows it
-    (Housner's law), at a fixed amplitude [g]. `amplitude` of a record scales all of it. `uplift_strength`, the uplift
+    (Housner's law), at a fixed amplitude [g]. `amplitude` of a record scales all of it. Numbers of a law and of a model
+    are named by where they are, such as `restitution.gentle` and `model.edge.radius`. `uplift_strength`, the uplift
     threshold over the amplitude, is varied through the amplitude. The function is a plain function of arrays:
     `jax.jit`, `jax.vmap` and further derivatives go through it.
 
     **Raises:** ValueError for arguments outside their ranges.
     """
     block, motion = in_real_numbers(block, motion)
+    check_single(model=model)
     return _sensitivity(block, motion, current_model(model, block, motion), engine)
 
 
 @jit_low_effort(follows_scenes=True)  # one program, because it has many operations
 def _sensitivity(block, motion, model, engine) -> Sensitivity:
-    parameters = named(block, motion)
+    parameters = named(block, motion, model)
     names, values = tuple(parameters), jnp.stack([jnp.asarray(v) for v in parameters.values()])
 
     def results(values):
-        changed = rebuilt(block, motion, dict(zip(names, jnp.unstack(values))), parameters["amplitude"])
-        result = outcome(*changed, model, engine=engine)
+        known = dict(zip(names, jnp.unstack(values)))
+        changed = *rebuilt(block, motion, known, parameters["amplitude"]), rebuilt_model(model, known)
+        result = outcome(*changed, engine=engine)
         return jnp.stack([getattr(result, name) for name in _RESULTS]), result
 
     rows, result = jax.jacfwd(results, has_aux=True)(values)
@@ -234,6 +238,7 @@ def sensitivity_map(
     *,
     alpha: ArrayLike = 0.2,
     restitution: ArrayLike | None = None,
+    opens: str | None = None,
     model: AbstractEquation = Housner(),
     engine: AbstractEngine | None = None,
     progress: bool | None = None,
@@ -245,7 +250,7 @@ def sensitivity_map(
     - `uplift_strength`: (rows,) uplift threshold over amplitude [-], positive; below 1 the block uplifts.
     - `pulse_duration`: (columns,) p t_d [-], positive.
     - `shape`: of the pulse, as in `ExponentialPulse`.
-    - `alpha`, `restitution`, `model`, `engine`, `progress`: as in `self_similar_spectrum`.
+    - `alpha`, `restitution`, `opens`, `model`, `engine`, `progress`: as in `self_similar_spectrum`.
 
     **Returns:** a `SensitivityMap`.
     With traced arguments (within `jax.jit`, `jax.vmap`, `jax.grad`) it is a plain function of arrays.
@@ -256,18 +261,18 @@ def sensitivity_map(
     """
     strength, duration = axis("uplift_strength", uplift_strength), axis("pulse_duration", pulse_duration)
     shape, alpha = scalar("shape", not_nan("shape", shape)), as_real("alpha", alpha)
-    block = Block(alpha, 1.0, restitution)  # raises here, where values are concrete
+    block = Block(alpha, 1.0, restitution, opens=opens)  # raises here, where values are concrete
     check_single(block=block)
     model = current_model(model, block, shape, strength, duration)
-    scene = shape, block.alpha, scaled_law(block), model, engine
+    scene = shape, BlockOfAnySize.of(block, scaled=True), model, engine
     sensitivities = surface(_under_lobe, (strength, duration), scene, "sensitivity", progress)
     return SensitivityMap(strength, duration, shape, sensitivities)
 
 
 @cheap_per_point
 def _under_lobe(strength, duration, scene) -> Sensitivity:
-    shape, alpha, restitution, model, engine = scene
-    block = Block(alpha, jnp.ones_like(alpha), restitution)
-    # Positive acceleration drives negative rotation; the size of the response is the same.
+    shape, of_block, model, engine = scene
+    block = of_block.sized(of_block.alpha, jnp.ones_like(of_block.alpha))
+    # Positive acceleration drives negative rotation, to the left; the size of the response to both sides is the same.
     pulse = ExponentialPulse(model.moments(block).threshold / strength, duration, shape)
     return sensitivity(block, pulse, model, engine=engine)

@@ -156,6 +156,8 @@ def _parts(form: Callable) -> tuple[list[str], dict[str, bool]]:
 def _check_law(block: Block) -> None:
     if block.law.depends_on_speed:
         raise ValueError("Argument `block` must have a restitution that does not depend on the speed of impacts.")
+    if block.opens is not None:
+        raise ValueError("Argument `block` must rock to both sides: groups do not tell the side to which a wall opens.")
     if tells_sides(block.law, block.corners):
         raise ValueError("Argument `block` must have a restitution that is the same on both sides.")
 

@@ -1,6 +1,5 @@
 """Rocking spectra and overturning maps."""
 
-import functools
 import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -17,7 +16,7 @@ from jaxrock._arguments.tables import AbstractTable, Column
 from jaxrock._core.arrays import Values, is_traced, to_device
 from jaxrock._core.progress import Progress
 from jaxrock._core.renamed import renamed
-from jaxrock.blocks.restitution import AbstractRestitution, Restitution
+from jaxrock.blocks.restitution import Restitution
 from jaxrock.blocks.rigid import Block
 from jaxrock.compiler import trace_function
 from jaxrock.engines.stepper import AbstractEngine
@@ -30,6 +29,7 @@ from jaxrock.motions.suite import Suite, warn_of_repeated
 from jaxrock.responses.current_model import current_model
 from jaxrock.responses.outcome import Outcome, outcome
 from jaxrock.status import Status, is_decided
+from jaxrock.studies.any_size import BlockOfAnySize, of_any_size
 from jaxrock.studies.spectrum import Spectrum
 from jaxrock.sweeps.runner import cheap_per_point
 from jaxrock.sweeps.sweep import surface
@@ -43,7 +43,7 @@ class OverturningMap(AbstractTable):
     - `state`: 0 safe, 1 overturned without impact, 2 overturned after impacts, -1 not computed (see `status`).
     - `rotation_ratio`: peak |rotation| over alpha [-]; infinite where the block overturned.
     - `impact_count`, `margin`, `status`: as in `Outcome`.
-    - `scene`: slenderness, restitution, pulse, model and engine of the map, for `overturning_borders`.
+    - `scene`: shape of the block, pulse, model and engine of the map, for `overturning_borders`.
     """
 
     frequency_ratio: Float[Array, " columns"]
@@ -93,6 +93,7 @@ def rocking_spectrum(
     model: AbstractEquation = Housner(),
     *,
     engine: AbstractEngine | None = None,
+    opens: str | None = None,
     progress: bool | None = None,
 ) -> Spectrum:
     """Compute the peak response of blocks of one slenderness and every size under one motion, or those of a suite.
@@ -102,7 +103,7 @@ def rocking_spectrum(
     - `alpha`: slenderness angle [rad], in (0, pi/2).
     - `motion`: any motion, or a `Suite`; a suite's motions run one after the other, and share programs.
     - `period`: (n,) values of 2 pi/p [s], positive.
-    - `restitution`, `model`, `engine`: as in `Block` and `outcome`.
+    - `restitution`, `opens`, `model`, `engine`: as in `Block` and `outcome`.
     - `progress`: whether to draw a progress bar; None: on a terminal, if it takes long.
 
     **Returns:** a `Spectrum` over the periods; of a suite, with an axis of motions in front: results (motions, n). A
@@ -114,10 +115,10 @@ def rocking_spectrum(
     **Source:** Makris & Konstantinidis (2003), the rocking spectrum.
     """
     period = axis("period", period, _period)
-    block = of_any_size(alpha, restitution)  # raises here, where values are concrete
+    block = of_any_size(alpha, restitution, opens)  # raises here, where values are concrete
 
     def under(motion, progress):
-        scene = block.alpha, block.law, motion, current_model(model, block, motion, period), engine
+        scene = BlockOfAnySize.of(block), motion, current_model(model, block, motion, period), engine
         return surface(_under_motion, (period,), scene, "spectrum", progress, names=_PEAKS)
 
     if not isinstance(motion, Suite):
@@ -144,6 +145,7 @@ def self_similar_spectrum(
     uplift_strength: Values | None = None,
     alpha: ArrayLike = 0.2,
     restitution: Restitution | None = None,
+    opens: str | None = None,
     pulse: Callable[..., AbstractMotion] = SinePulse,
     model: AbstractEquation = Housner(),
     engine: AbstractEngine | None = None,
@@ -160,7 +162,8 @@ def self_similar_spectrum(
       (`rk.intensity.peak_acceleration`).
     - `pulse_duration`, `uplift_strength`: (n,) and (rows,) alternatives to these two axes, positive: p times the
       duration (or period) of the pulse [-], and uplift threshold over peak acceleration [-].
-    - `alpha`, `restitution`: of the block. In the linear model alpha plays no part.
+    - `alpha`, `restitution`, `opens`: as in `Block`. In the linear model alpha plays no part. Positive
+      acceleration lifts a wall that opens to the left.
     - `pulse`: makes a motion from amplitude [g] and period (or duration, for pulses that have one) [s]: a pulse of the
       package, or any function that JAX can trace. The values that it reads may have changed since the last call.
     - `model`, `engine`, `progress`: as in `rocking_spectrum`.
@@ -175,7 +178,7 @@ def self_similar_spectrum(
     **Source:** Dimitrakopoulos & DeJong (2012), section 4; Voyagaki, Psycharis & Mylonakis (2012), 2.2, figure 3.5.
     """
     axes = _PulseAxes.of(frequency_ratio, intensity, pulse_duration, uplift_strength, parameters)
-    scene = _scene(axes, alpha, restitution, pulse, model, engine)
+    scene = _scene(axes, of_any_size(alpha, restitution, opens), pulse, model, engine)
     results = _over_pulses(axes, scene, "spectrum", progress, _PEAKS)
     return Spectrum(abscissa=axes.ratio, intensity=axes.intensity, parameters=axes.lists, **results)
 
@@ -189,6 +192,7 @@ def overturning_map(
     uplift_strength: Values | None = None,
     alpha: ArrayLike = 0.2,
     restitution: Restitution | None = None,
+    opens: str | None = None,
     pulse: Callable[..., AbstractMotion] = SinePulse,
     model: AbstractEquation = Housner(),
     engine: AbstractEngine | None = None,
@@ -208,7 +212,7 @@ def overturning_map(
     (2012), 2.2, figures 3.1 to 3.3 and 3.6.
     """
     axes = _PulseAxes.of(frequency_ratio, intensity, pulse_duration, uplift_strength, parameters)
-    scene = _scene(axes, alpha, restitution, pulse, model, engine)
+    scene = _scene(axes, of_any_size(alpha, restitution, opens), pulse, model, engine)
     results = _over_pulses(axes, scene, "map", progress, _STATES)
     return OverturningMap(
         frequency_ratio=axes.ratio, intensity=axes.intensity, parameters=axes.lists, scene=scene, **results
@@ -249,13 +253,13 @@ def _either(name: str, values: Values | None, other: str, others: Values | None,
     raise ValueError(f"Argument `{name}` must be given, or `{other}` in its place, but {which}.")
 
 
-def _scene(axes: _PulseAxes, alpha, restitution, pulse, model, engine) -> tuple:
+def _scene(axes: _PulseAxes, block: Block, pulse, model, engine) -> tuple:
     """Return the part that all points share: a pytree, which holds the scalar parameters of the pulse."""
-    block, lists = of_any_size(alpha, restitution), tuple(axes.lists)
+    lists = tuple(axes.lists)
     numbers = {name: value for name, value in axes.parameters.items() if name not in lists}
     number = jax.ShapeDtypeStruct((), jnp.result_type(block.alpha, *axes.parameters.values(), *axes[:2]))
     made = _Family(trace_function(pulse, number, number, **dict.fromkeys(axes.parameters, number)), numbers, lists)
-    return block.alpha, scaled_law(block), made, current_model(model, block, axes.ratio, axes.intensity), engine
+    return BlockOfAnySize.of(block, scaled=True), made, current_model(model, block, axes.ratio, axes.intensity), engine
 
 
 class _Family(eqx.Module):
@@ -276,28 +280,6 @@ def _over_pulses(
     points = (*axes.lists.values(), axes.intensity, axes.ratio)
     # Points that are neighbours in intensity share a chunk, because they move alike.
     return surface(_under_pulse, points, scene, label, progress, columns=True, names=names)
-
-
-def of_any_size(alpha: ArrayLike, restitution: Restitution | None) -> Block:
-    """Return a block that stands for blocks of every size, cached for plain numbers.
-
-    Making it takes a quarter of the time of a small map.
-    """
-    if isinstance(alpha, float) and isinstance(restitution, float | None):
-        return _of_plain_numbers(alpha, restitution, jnp.result_type(float))
-    return Block(alpha, 1.0, restitution)
-
-
-@functools.lru_cache(maxsize=64)
-def _of_plain_numbers(alpha: float, restitution: float | None, precision: np.dtype) -> Block:
-    return Block(alpha, 1.0, restitution)  # in the precision of the session
-
-
-def scaled_law(block: Block) -> AbstractRestitution:
-    """Return the restitution of a block of any size; ValueError if it depends on the speed of impacts."""
-    if block.law.depends_on_speed:
-        raise ValueError("Argument `restitution` must not depend on the speed of impacts, where size plays no part.")
-    return block.law
 
 
 _period = Range("be positive and finite, from 1e-5 to 1e6", 0.0, np.inf, lambda x: (x >= 1e-5) & (x <= 1e6))  # 2 pi/p
@@ -341,17 +323,17 @@ def _kept(result: Outcome, block: Block) -> dict:
 
 @cheap_per_point
 def _under_motion(period, scene):
-    alpha, restitution, motion, model, engine = scene
-    alpha, period = _in_one_precision(alpha, period, of=motion)
-    block = Block(alpha, 2 * jnp.pi / period, restitution)
+    shape, motion, model, engine = scene
+    alpha, period = _in_one_precision(shape.alpha, period, of=motion)
+    block = shape.sized(alpha, 2 * jnp.pi / period)
     return _kept(outcome(block, motion, model, engine=engine), block)
 
 
 def under_pulse(*point_and_scene) -> tuple[Outcome, Block]:
     """Return the outcome at one point, and the block: `(*parameters, intensity, ratio, scene)`."""
-    *point, (alpha, restitution, pulse, model, engine) = point_and_scene
-    alpha, *parameters, intensity, ratio = _in_one_precision(alpha, *point)
-    block = Block(alpha, jnp.ones_like(alpha), restitution)
+    *point, (shape, pulse, model, engine) = point_and_scene
+    alpha, *parameters, intensity, ratio = _in_one_precision(shape.alpha, *point)
+    block = shape.sized(alpha, jnp.ones_like(alpha))
     motion = pulse(intensity * model.moments(block).threshold, 2 * jnp.pi / ratio, *parameters)
     return outcome(block, motion, model, engine=engine), block
 

@@ -4,7 +4,8 @@ Motions run one after the other; the scenes of one motion run together and share
 next power of two, so that a few programs serve a suite of any lengths.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
 from typing import NamedTuple
 
 import jax
@@ -27,6 +28,7 @@ from jaxrock.motions.suite import Suite
 from jaxrock.responses.current_model import current_model
 from jaxrock.responses.outcome import Outcome, outcome
 from jaxrock.status import Status, is_decided
+from jaxrock.studies.parameters import rebuilt_model
 
 STOOD, TOPPLED, UNDECIDED = 0, 1, -1
 BOUNDS = ("lower", "upper", "share")  # ways to count undecided scenes: none, all, or the share that topples
@@ -80,7 +82,7 @@ def _of_each(blocks: Block | AsymmetricBlock, function: Callable[[np.ndarray], n
 
 def is_symmetric(block: Block | AsymmetricBlock) -> bool:
     """Return whether a block is its own mirror image, so that turning it round changes nothing."""
-    return isinstance(block, Block) and not tells_sides(block.law, block.corners)
+    return isinstance(block, Block) and block.opens is None and not tells_sides(block.law, block.corners)
 
 
 def both_ways(factors: np.ndarray, facing: str) -> np.ndarray:
@@ -118,18 +120,28 @@ def comes_back(verdict: np.ndarray) -> np.ndarray:
 
 
 def scenes_of_suite(
-    blocks: Block | AsymmetricBlock, suite: Suite, factors: np.ndarray, model: AbstractEquation, engine, progress
+    blocks: Block | AsymmetricBlock,
+    suite: Suite,
+    factors: np.ndarray,
+    model: AbstractEquation,
+    engine,
+    progress,
+    varied: Mapping[str, np.ndarray] = MappingProxyType({}),
 ) -> Scenes:
-    """Compute stacked blocks under every motion of a suite times factors: (motions, factors) or (factors,) for all."""
+    """Compute stacked blocks under every motion of a suite times factors: (motions, factors) or (factors,) for all.
+
+    `varied`: parameters of the model that differ from block to block, by name.
+    """
     factors = np.broadcast_to(factors, (len(suite), np.shape(factors)[-1]))
     draws, count = jax.tree.leaves(blocks)[0].shape[0], factors.shape[1]
     # Neighbours differ by the factor, so they move alike.
     lanes = _of_each(blocks, lambda x: np.repeat(x, count))
+    more = {name: to_device(np.repeat(x, count)) for name, x in varied.items()}
     model = current_model(model, lanes, next(suite.motions()), factors)
     bar = Progress(factors.size * draws, "suite", progress)
     found = []
     for motion, row in zip(suite.motions(), factors):
-        found.append(of_motion(with_room(motion), lanes, to_device(np.tile(row, draws)), model, engine))
+        found.append(of_motion(with_room(motion), lanes, to_device(np.tile(row, draws)), model, engine, more))
         bar.add(count * draws)
     shape = len(suite), draws, count
     parts = (np.stack([np.asarray(x) for x in part]).reshape(shape).swapaxes(1, 2) for part in zip(*found))
@@ -137,12 +149,13 @@ def scenes_of_suite(
 
 
 @jit_low_effort(follows_scenes=True)
-def of_motion(motion, blocks, factors, model, engine) -> Scenes:
-    """Compute all scenes of one motion, side by side: stacked blocks, each with its factor."""
+def of_motion(motion, blocks, factors, model, engine, varied) -> Scenes:
+    """Compute all scenes of one motion, side by side: stacked blocks, each with its factor and parameters of the
+    model."""
 
     def one(lane, factor):
-        block = one_of_many(blocks, lane)
-        result = outcome(block, scaled_and_mirrored(motion, factor), model, engine=engine)
+        block, own = one_of_many(blocks, lane), rebuilt_model(model, {name: x[lane] for name, x in varied.items()})
+        result = outcome(block, scaled_and_mirrored(motion, factor), own, engine=engine)
         alpha = jnp.minimum(block.alpha1, block.alpha2) if isinstance(block, AsymmetricBlock) else block.alpha
         verdict, share = verdict_and_share(result)
         rotation, margin = (

@@ -35,6 +35,8 @@ WITH_PROGRAMS = {"while", "cond", "jit", "pjit", "closed_call", "custom_jvp_call
 class Emitter:
     """Emit the instructions of jaxprs into one LLVM function."""
 
+    small = SMALL
+
     def __init__(self, builder: ir.IRBuilder, lanes: int):
         self.b, self.lanes = builder, lanes
         self.before = []  # the basic_block before each enclosing loop
@@ -197,6 +199,10 @@ class Emitter:
         if (operation := operation_of(name)) is None:
             raise Unsupported(f"operation {name}")
         return [for_each(lambda *values: operation(self, equation, *values), *inputs)]
+
+    def applied(self, equation, inputs: list):
+        """Emit an operation on vectors and arrays in registers."""
+        return self._apply(equation, inputs, None)[0]
 
     def loop(self, parameters: dict, inputs: list, active, leaves: Callable | None = None) -> tuple[list, Any]:
         """Emit a loop; return the final state and the mask of unfinished lanes.

@@ -58,11 +58,21 @@ def for_each(function: Callable, *inputs):
 
 def of_memory(e, equation, memory: Any, *more):
     """Emit an operation on a long array, or a select between two long arrays."""
-    name, parameters = equation.primitive.name, equation.params
+    name, inputs = equation.primitive.name, [memory, *more]
     if name == "select_n" and [type(x) for x in more] == [Memory, Memory]:
         return _one_of_two(e, memory, *more)
-    if not isinstance(memory, Memory):
+    if isinstance(memory, Memory) and (found := _part_of_memory(e, equation, memory, *more)) is not None:
+        return found
+    # Parts of long arrays may be as short as those in registers.
+    inputs = [_loaded(e, x) if isinstance(x, Memory) and x.rows is None and x.size <= e.small else x for x in inputs]
+    if any(isinstance(x, Memory) for x in inputs):
         raise Unsupported(f"{name} of a long list")
+    return e.applied(equation, inputs)
+
+
+def _part_of_memory(e, equation, memory: Memory, *more):
+    """Emit the choice of a part, or of one element, of a long array; None for another operation."""
+    name, parameters = equation.primitive.name, equation.params
     sizes = parameters.get("slice_sizes", ())
     if name == "slice" and not parameters["strides"]:
         (*first, start), (*last, stop) = parameters["start_indices"], parameters["limit_indices"]
@@ -74,9 +84,12 @@ def of_memory(e, equation, memory: Any, *more):
         return _looked_up(e, memory, more[-1])
     if name == "gather" and _is_column(parameters, memory):
         return _looked_up(e, memory, boxed(more[0])[0])
-    if name in NOTHING:
-        return memory
-    raise Unsupported(f"{name} of a long list")
+    return memory if name in NOTHING else None
+
+
+def _loaded(e, memory: Memory) -> np.ndarray:
+    """Emit the load of a whole array."""
+    return boxed([_look_up(e, memory, e.constant(k, np.int32)) for k in range(memory.size)])
 
 
 def _one_of_two(e, which, other: Memory, one: Memory) -> Memory:

@@ -44,8 +44,10 @@ from jaxrock.engines.diffrax.guards import (
 from jaxrock.engines.diffrax.static_with_arrays import StaticWithArrays
 from jaxrock.engines.events import WATCHED, Events, landed
 from jaxrock.engines.impact import impact
+from jaxrock.engines.memory import remembered
 from jaxrock.engines.rest import wait
 from jaxrock.engines.scene import Scene
+from jaxrock.engines.settling import settled
 from jaxrock.engines.state import Node, State
 from jaxrock.engines.stepper import AbstractEngine, AbstractStepper
 from jaxrock.models.equation import Angle
@@ -253,61 +255,24 @@ class ArcStepper(AbstractStepper):
         eps = float(jnp.finfo(scene.p.dtype).eps)
         resting = state.side == 0
         waited = wait(self, state, forcing.shaking, forcing.unit, DIFFRAX_POLICY.order, eps, cond_select)
-        rocked = self.on(state.side)._rock(state, forcing, ~resting)
+        rocked = self.at(state)._rock(state, forcing, ~resting)
         after = checked_step(self, state, jax.tree.map(lambda a, b: jnp.where(resting, a, b), waited, rocked))
         if self.history:
             return after
-        # After the motion a block that has fallen back and turned below its saddle is safe: it only loses energy.
-        quiet = (state.piece >= scene.pieces) & (after.side != 0)
-        turned = quiet & (state.velocity >= 0) & (after.velocity == 0) & ~after.beyond & (after.opening > 0)
-        turned = turned & (after.impact_time > scene.motion.end)
-        if scene.far is not None:
-            turned = turned & self._outdone(after)
         goes = (after.status == Status.successful) | (after.status == Status.undecided) & self.has_copies
-        return replace(after, done=after.done | turned | ~goes)
-
-    def _outdone(self, state: State) -> Flag:
-        """Return whether an asymmetric block that has turned back can neither fall on the other side, nor come higher
-        or closer to balance there. Its energy is too small to reach some angle below all that."""
-        scene = self.scene.on(state.side)
-        far, whole = scene.both_moments[1], scene.moments.work(state.opening)
-        left = scene.reset.most(jnp.sqrt(2 * whole)) ** 2 * whole
-        outdone = jnp.zeros_like(state.done)
-        for share in (0.999, 0.7, 0.4, 0.1):
-            opening = share * jnp.minimum(state.peak, far.saddle)
-            least = (far.restoring(Angle.of(opening)) / far.restoring_at_rest) ** 2
-            outdone = outdone | ((left < far.work(opening)) & (least >= state.closeness))
-        return outdone
+        return settled(self, state, replace(after, done=after.done | ~goes))
 
     def finish(self, state: State) -> State:
         """Follow the free stage by the same arcs."""
-        if not self.history:
-            return state
-        stepper = ArcStepper(self.scene, None, False, self.engine)
-        moving = (state.side != 0) & ~state.overturned & (state.piece >= self.scene.pieces)
-        state = replace(state, done=~moving | ~state.done, steps=jnp.zeros_like(state.steps))
-        return stepper.to_the_end(state)
+        return self.after_history(state) if self.history else state
 
     @property
     def follows_free_stage(self) -> bool:
         return not self.history
 
-    def to_the_end(self, state: State) -> State:
-        """Advance through the free stage, too; impacts there count only if the block overturns after them."""
-        budget, pieces = self.engine.budget(self.scene, history=False), self.scene.pieces
-
-        def step(carry):
-            state, counted = carry
-            after = self.advance(state)
-            return after, jnp.where(state.piece < pieces, after.impacts, counted)
-
-        carry = state, state.impacts
-        state, counted = self.engine.loop(lambda c: ~c[0].done & (c[0].steps < budget), step, carry, budget)
-        return replace(state, impacts=jnp.where(state.overturned, state.impacts, counted))
-
     def evaluate(self, node: Node, elapsed: Scalar) -> tuple[Scalar, Scalar]:
         """Solve again from the node."""
-        scene = self.scene.on(node.side)
+        scene = self.at(node).scene
         arc = ArcProblem.of(scene, node, Forcing.of(scene, node), self.history)
 
         def run(scene):
@@ -371,6 +336,9 @@ class ArcStepper(AbstractStepper):
             spread=spread,
             done=over & self.history,  # an outcome continues through the free stage
         )
+        if scene.moments.remembers:
+            after, lets_go = remembered(self, state, after)
+            hits = hits._replace(saddle=hits.saddle | lets_go)
         after = replace(after, side=jnp.where(void, 0.0, after.side))
         return self._happen(state, after, arc, hits, y, lost, solution.result)
 

@@ -97,10 +97,10 @@ def is_hop(stepper: AbstractStepper, state: State, arc: "ArcProblem") -> Flag:
     back = jnp.where(acceleration < 0, -acceleration, 1.0)
     flight, height = 4 * v / (back * stepper.scene.p), v * v / back
     weight = forcing.shaking.now[1]
-    pull = moments.stiffness * (1.0 if weight is None else weight) + moments.restoring_at_rest + back
+    pull = moments.steepest_start * (1.0 if weight is None else weight) + moments.restoring_at_rest + back
     change = moments.change_at_rest(*forcing.steepest) * flight + 2 * height * pull
     certain = (change <= back / 2) & (flight <= jnp.minimum(stepper.room(state), forcing.reach))
-    least = (moments.restoring(Angle.of(jnp.minimum(height, moments.saddle))) / moments.restoring_at_rest) ** 2
+    least = (moments.fall(Angle.of(jnp.minimum(height, moments.saddle))) / moments.fall_at_rest) ** 2
     small = (height <= 0.999 * state.peak) & (2 * v <= state.fastest) & (least >= state.closeness)
     starts = (state.opening == 0) & (v > 0) & (acceleration < 0)
     if arc.bend is not None:
@@ -211,7 +211,9 @@ def _smooth(moments: AbstractMoments, start: State | Node, forcing: Forcing) -> 
         return moments, None
     acceleration, weight = forcing(jnp.zeros_like(start.opening))
     begins = moments.acceleration(Angle.of(start.opening), start.velocity, start.side * acceleration, weight)
-    return moments.ahead(start.opening, select(start.velocity == 0, begins >= 0, start.velocity > 0))
+    # From the ground a block can only open, although rounding may decide the sign of an acceleration that is zero.
+    opens = (begins >= 0) | (start.opening == 0)
+    return moments.ahead(start.opening, select(start.velocity == 0, opens, start.velocity > 0))
 
 
 def _guard(time: Scalar, value: Scalar, jet: list[Scalar], active: Flag | bool) -> Scalar:

@@ -8,10 +8,9 @@ A block at rest waits for the threshold. Under `jax.vmap` lanes advance together
 lane needs is not taken.
 """
 
-import functools
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any
 
 import equinox as eqx
 import jax
@@ -29,13 +28,14 @@ from jaxrock.engines.free_stage import FreeStage, Visit, free_stage
 from jaxrock.engines.impact import impact
 from jaxrock.engines.rest import wait
 from jaxrock.engines.scene import Scene
+from jaxrock.engines.settling import settled
 from jaxrock.engines.state import Node, State, surpasses
 from jaxrock.engines.stepper import AbstractEngine, AbstractStepper
 from jaxrock.engines.taylor.expansion import End, Start, arrive, extreme_speed, taylor_expansion
 from jaxrock.engines.taylor.policy import POLICY, exact
-from jaxrock.engines.taylor.step_start import clear_start, overshoot, signs_at_start, unbalanced
+from jaxrock.engines.taylor.step_start import clear_start
 from jaxrock.engines.taylor.tape import end_on_tape, on_tape
-from jaxrock.models.coefficients import Coefficients
+from jaxrock.engines.taylor.whole_step import Cut, Step
 from jaxrock.models.equation import Angle
 from jaxrock.motions.shaking import Shaking
 from jaxrock.numerics.derivatives_of import with_derivatives_of
@@ -45,11 +45,9 @@ from jaxrock.numerics.polynomial import (
     first_event,
     horner,
     jet,
-    keeps_sign,
     longest,
     remainder,
     rescaled,
-    step_length,
 )
 from jaxrock.status import Status
 
@@ -78,14 +76,18 @@ class Series(AbstractEngine):
 
     def stepper(self, scene: Scene, stop: Scalar | None, history: bool, taped: bool = False) -> "TaylorStepper":
         """Return the stepper of a scene; short pieces of a record need few terms."""
-        if not isinstance(scene.moments, Coefficients):
-            raise ValueError("Argument `engine` must be a Diffrax(...) for a model that is given as functions.")
+        moments: Any = scene.moments
+        if not moments.has_series:
+            raise ValueError(
+                "Argument `engine` must be a Diffrax(...) for a model that is given as functions, or has ties that "
+                "yield or break."
+            )
         tolerance = self.tolerance or exact(scene.p.dtype)
         return TaylorStepper(
             scene=scene,
             stop=stop,
             engine=self,
-            order=self.order or POLICY.order(scene.most_pieces, tolerance, not scene.moments.trigonometric),
+            order=self.order or POLICY.order(scene.pieces_of_part, tolerance, not moments.trigonometric),
             tolerance=tolerance,
             history=history,
             taped=taped,
@@ -140,7 +142,13 @@ class TaylorStepper(AbstractStepper):
         resting = state.side == 0
         waited = wait(self, state, shaking, unit, self.order, self.tolerance, cond_any)
         rocked = self.on(state.side)._rock(state, shaking, unit, ~resting)
-        return checked_step(self, state, jax.tree.map(lambda a, b: select(resting, a, b), waited, rocked))
+        after = checked_step(self, state, jax.tree.map(lambda a, b: select(resting, a, b), waited, rocked))
+        return settled(self, state, after)
+
+    @property
+    def follows_free_stage(self) -> bool:
+        """Return whether the free stage has no closed form, unless for a history."""
+        return not self.history and not self.scene.moments.has_free_swing
 
     def on_tape(self, state: State, budget: int) -> tuple[State, State]:
         """Follow a block so that reverse mode differentiates its steps, and return all states, as `states_of`."""
@@ -152,9 +160,11 @@ class TaylorStepper(AbstractStepper):
         return end_on_tape(self, state)
 
     def finish(self, state: State) -> State:
-        """Solve the free stage by energy."""
+        """Solve the free stage: by energy where that is known, else by steps."""
+        if not self.scene.moments.has_free_swing:
+            return self.after_history(state) if self.history else state
         scene = self.scene.on(state.side)
-        moments: Any = scene.moments  # `Coefficients`: this engine solves no others
+        moments: Any = scene.moments  # `Coefficients`: no others have a free swing in closed form
         moving = (state.side != 0) & ~state.overturned & (state.piece >= scene.pieces)
         moving = moving & ((state.opening != 0) | (state.velocity != 0))  # not lifted for zero time
         other: Any = scene.both_moments[1]
@@ -230,7 +240,7 @@ class TaylorStepper(AbstractStepper):
         start, room = self.start(state, shaking, unit), jnp.minimum(self.room(state), 32 * unit) / unit
         # The step is found without derivatives; then its end moves as the flow and the event determine.
         stepper, before, begin, reach = stop_gradient((self, state, start, room))
-        step = _Step.of(stepper, before, begin, reach, rocking)
+        step = Step.of(stepper, before, begin, reach, rocking)
         cut = cond_any(step.eventful, lambda cut, *flags: stepper._cut(before, step, *flags), step.whole)
         hits = cut.hits
         early = cut.length < step.length
@@ -270,7 +280,7 @@ class TaylorStepper(AbstractStepper):
             uplifting=state.uplifting & ~moved,
             extremal=select(moved, hits.extremum, state.extremal),
             fastest=select(moved, jnp.maximum(state.fastest, fastest), state.fastest),
-            done=over,
+            done=over & (not self.follows_free_stage),
         )
 
         def happen(passed, needed, inside):
@@ -283,7 +293,7 @@ class TaylorStepper(AbstractStepper):
         ends = overturned & down if self.history else overturned
         return replace(stepped, overturned=overturned, done=stepped.done | ends)
 
-    def _cut(self, state: State, step: "_Step", needed: Flag, inside) -> "_Cut":
+    def _cut(self, state: State, step: Step, needed: Flag, inside) -> Cut:
         """Find the first event of a step."""
         length, saddle = inside(step.length), self.scene.moments.saddle
         scaled = [inside(c) for c in rescaled(step.coefficients, length)]
@@ -300,9 +310,9 @@ class TaylorStepper(AbstractStepper):
         opening, speed, acceleration = landing.jet[0], landing.jet[1] / length, landing.jet[2] / length**2
         never = [jnp.zeros_like(landing.hits[0])] * (len(Events._fields) - len(watches))
         hits = Events(*landing.hits, *never)
-        return _Cut(landing.x * length, opening, speed, acceleration, hits._replace(impact=hits.impact & (speed <= 0)))
+        return Cut(landing.x * length, opening, speed, acceleration, hits._replace(impact=hits.impact & (speed <= 0)))
 
-    def _happen(self, state: State, passed: State, start: Start, step: "_Step", end, cut: "_Cut", inside) -> State:
+    def _happen(self, state: State, passed: State, start: Start, step: Step, end, cut: Cut, inside) -> State:
         """Apply the event at the end of a step."""
         length, opening, velocity = (inside(value) for value in end)
         shaking = start.shaking.each(lambda terms: [inside(u) for u in terms])
@@ -333,61 +343,3 @@ class TaylorStepper(AbstractStepper):
         least = (moments.restoring(Angle.of(top)) / moments.restoring_at_rest) ** 2
         inward = state.velocity < 0  # it may graze the ground
         return inward | state.beyond | (top >= 0.999 * state.peak) | (least < state.closeness)  # 0.999: near ties, too
-
-
-class _Cut(NamedTuple):
-    """The end of a step after a cut at its event, in the unit of the step's time."""
-
-    length: Scalar
-    opening: Scalar
-    speed: Scalar
-    acceleration: Scalar
-    hits: Events
-
-
-class _Step(NamedTuple):
-    """A Taylor step over the whole reach of its series, with tests for events within it."""
-
-    coefficients: list[Scalar]
-    length: Scalar
-    full: Flag  # goes to the end of the room
-    signs: tuple[Scalar, Scalar]  # initial signs of velocity and acceleration
-    monotone: Flag  # the acceleration keeps its sign: at most one turning point
-    faster: Flag  # the velocity may exceed the largest so far
-    eventful: Flag
-    whole: _Cut  # its end, if no event cuts it
-
-    @classmethod
-    def of(cls, stepper: TaylorStepper, state: State, start: Start, room: Scalar, rocking: Flag) -> "_Step":
-        """Compute the step from a state on."""
-        scene, order = stepper.scene, stepper.order
-        coefficients = unbalanced(taylor_expansion(start, order).opening)
-        # Relative to the motion itself while it is small: tiny rotations keep their digits, too.
-        size = functools.reduce(jnp.maximum, [jnp.abs(c) for c in coefficients[: max(order // 2, 4)]])
-        size = jnp.minimum(scene.alpha, size)
-        length = step_length(coefficients, stepper.tolerance * size, jnp.minimum(room, stepper.longest))
-        full = length >= room * (1 - 1e-9)
-        length = materialize(select(full, room, length), state.local)
-        opening, speed = (materialize(value, state.local) for value in jet(coefficients, length, 1))
-
-        signs = signs_at_start(state, coefficients)
-        turning = materialize(keeps_sign(derivative(coefficients), signs[0], length), state.local) <= 0
-        crossing = (opening >= scene.moments.saddle) != state.beyond
-        top = jnp.maximum(jnp.abs(coefficients[1]), jnp.abs(speed)) + materialize(
-            overshoot(coefficients, length), state.local
-        )
-        monotone = materialize(keeps_sign(derivative(derivative(coefficients)), signs[1], length), state.local) > 0
-        faster = (top > state.fastest * start.stretch) & ~monotone
-        eventful = turning | crossing | faster | (opening <= 0)
-        if stepper.history:
-            eventful = eventful | (opening >= jnp.pi / 2)
-        return cls(
-            coefficients=coefficients,
-            length=length,
-            full=full,
-            signs=signs,
-            monotone=monotone,
-            faster=faster,
-            eventful=eventful & rocking & (length > 0),
-            whole=_Cut(length, opening, speed, jnp.zeros_like(speed), Events(*[jnp.zeros_like(full)] * 5)),
-        )

@@ -43,7 +43,7 @@ class EventFreeSteps(NamedTuple):
     def of(cls, stepper: TaylorStepper, state: State) -> "EventFreeSteps":
         """Begin a glide."""
         zero = jnp.zeros_like(state.opening)
-        moments: Any = stepper.on(state.side).scene.moments  # `Coefficients`: this engine solves no others
+        moments: Any = stepper.on(state.side).scene.moments
         # So far from balance that the error of the state cannot matter (see `record_extrema`).
         doubt = 1.5 * stepper.doubt * MOST_OFF * moments.saddle
         pull = jnp.maximum(jnp.sqrt(state.closeness) * moments.restoring_at_rest, doubt)
@@ -99,7 +99,7 @@ def onward(stepper: TaylorStepper, state: State, glide: EventFreeSteps) -> tuple
         opening=moved(opening, state.opening),
         velocity=moved(velocity, state.velocity),
         fastest=select(sure & (now > state.fastest), now, state.fastest),
-        done=sure & over,
+        done=sure & over & (not stepper.follows_free_stage),
         steps=state.steps + sure,
     )
     return after, glide._replace(

@@ -19,6 +19,7 @@ from jaxrock.engines.bookkeeping import checked_step, errors_after, escaped, rec
 from jaxrock.engines.events import Events, landed
 from jaxrock.engines.impact import impact
 from jaxrock.engines.rest import lift, longest_wait
+from jaxrock.engines.settling import settled
 from jaxrock.engines.state import State
 from jaxrock.engines.taylor.accurate import TaylorStepper
 from jaxrock.engines.taylor.expansion import Start, taylor_expansion
@@ -151,9 +152,9 @@ class _Meeting(NamedTuple):
     hits: Events  # the events that end it
 
 
-def _meeting(start: Start, terms: list[Scalar], part: _Part, state: State) -> _Meeting:
+def _meeting(start: Start, terms: list[Scalar], part: _Part, state: State, saddle: Scalar) -> _Meeting:
     """Find the turning point within a part, and the first level that it meets, before or after it turns."""
-    one, saddle, zero = start.one, start.moments.saddle, jnp.zeros_like(part.length)
+    one, zero = start.one, jnp.zeros_like(part.length)
     turns = materialize_flag(part.outward * part.speed < 0, state.local)
 
     def turn():
@@ -238,7 +239,7 @@ def advance(stepper: TaylorStepper, state: State) -> State:
     size = functools.reduce(jnp.maximum, [jnp.abs(c) for c in terms[: max(order // 2, 4)]])
     least = stepper.tolerance * materialize_by(jnp.minimum(scene.alpha, size), one)
     part = _part(start, terms, jnp.minimum(stepper.room(state) * (1 / unit), 32.0), least, stepper.longest)
-    meeting = _meeting(start, terms, part, state)
+    meeting = _meeting(start, terms, part, state, scene.moments.saddle)
     at, hits = meeting.at, meeting.hits
     fast, sure = _fastest(start, terms, part, at, state.fastest * stretch)
     certain = materialize_flag(meeting.certain & sure & _stands(stepper, meeting), state.local)
@@ -263,7 +264,7 @@ def advance(stepper: TaylorStepper, state: State) -> State:
         beyond=state.beyond ^ hits.saddle,
         uplifting=jnp.zeros_like(state.uplifting),
         fastest=jnp.maximum(state.fastest, jnp.maximum(fast / stretch, jnp.abs(velocity))),
-        done=over,
+        done=over & (not stepper.follows_free_stage),
     )
 
     def noted_now():
@@ -293,7 +294,7 @@ def advance(stepper: TaylorStepper, state: State) -> State:
         done=struck.done | lost | ~certain,
         status=Status.where(postponed, Status.solver_failed, struck.status),
     )
-    return checked_step(stepper, state, after)
+    return settled(stepper, state, checked_step(stepper, state, after))
 
 
 def certain_wait(stepper: TaylorStepper, state: State) -> State:
@@ -304,7 +305,8 @@ def certain_wait(stepper: TaylorStepper, state: State) -> State:
     length = longest_wait(stepper, shaking, room, order, stepper.tolerance)
     drives = scene.drives_of(shaking)
     share = jnp.ones_like(length)
-    for drive, _ in drives if shaking.vertical is not None else drives[:1]:
+    alike = shaking.vertical is None and scene.only_side is None  # one is minus the other
+    for drive, _ in drives[:1] if alike else drives:
         share = jnp.minimum(share, _monotone(drive, length))
     full = (length >= room * (1 - 1e-9)) & (share == 1)
     length = materialize(share * length, state.local)

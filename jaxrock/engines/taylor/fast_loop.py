@@ -5,6 +5,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Int
 
 from jaxrock.compiler.hints import divergent, supports_divergence
+from jaxrock.engines.scene import Scene
 from jaxrock.engines.state import State
 from jaxrock.engines.taylor.accurate import TaylorStepper
 from jaxrock.engines.taylor.event_free_step import EventFreeSteps, flush_error, onward
@@ -12,15 +13,19 @@ from jaxrock.engines.taylor.fast import advance, certain_wait
 from jaxrock.engines.taylor.policy import POLICY
 
 
-def most_steps(pieces: int) -> int:
+def most_steps(scene: Scene) -> Int[Array, ""] | int:
     """Return the number of steps after which a scene is left to the accurate pass."""
-    return POLICY.fast_steps + 3 * pieces
+    most = POLICY.fast_steps + 3 * scene.most_pieces
+    if scene.cycles is None:
+        return most
+    more = POLICY.steps_per_cycle * scene.cycles
+    return (most + jnp.minimum(more, POLICY.outcome_steps - POLICY.fast_steps)).astype(jnp.int32)
 
 
 def fast_loop(stepper: TaylorStepper, state: State, limit: Int[Array, ""] | int) -> State:
     """Follow a block to the end of the motion, until it is rejected, or until it has taken `limit` steps in all."""
-    limit = jnp.minimum(limit, most_steps(stepper.scene.most_pieces))
-    is_record = POLICY.is_record(stepper.scene.most_pieces)
+    limit = jnp.minimum(limit, most_steps(stepper.scene))
+    is_record = POLICY.is_record(stepper.scene.pieces_of_part)
     return (_under_record if is_record else _under_pulse)(stepper, state, limit)
 
 

@@ -15,6 +15,7 @@ class Policy(NamedTuple):
     - `many_pieces`: number of pieces above which a motion counts as a record.
     - `outcome_steps`: step budget of an outcome; `history_steps`: of a history, besides two for each piece.
     - `fast_steps`: steps after which a scene is left to the accurate pass, besides three for each piece.
+    - `steps_per_cycle`: more of these for each cycle of a harmonic motion.
     - `shorter`: shares of a step that are tried for a certificate, after the whole.
     - `round`: steps after which scenes under a record form new chunks where XLA follows them.
     """
@@ -26,6 +27,7 @@ class Policy(NamedTuple):
     outcome_steps: int = 100_000
     history_steps: int = 4096
     fast_steps: int = 1000
+    steps_per_cycle: int = 16
     shorter: tuple[float, ...] = (0.4, 0.1)
     round: int = 256
 

@@ -90,7 +90,7 @@ def _by_series(stepper: TaylorStepper, start: Start, unit: Scalar, whole: Scalar
 def _is_linear(start: Start) -> bool:
     """Return whether x'' = rate (x - saddle) + a straight line."""
     moments, (horizontal, vertical) = start.moments, start.shaking
-    is_line = not moments.trigonometric and moments.arm_terms.line is None
+    is_line = not moments.trigonometric and moments.groups.arm.line is None and moments.has_free_swing
     return is_line and vertical is None and len(horizontal) <= 2
 
 
