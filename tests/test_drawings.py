@@ -18,6 +18,7 @@ from scipy.integrate import quad
 
 import jaxrock as rk
 from jaxrock.plot.bodies import Body
+from jaxrock.plot.style import RED
 
 BLOCK = rk.Block.from_dimensions(0.6, 1.8)
 ROCK = rk.blocks.AsymmetricBlock.from_corners([0.3, 0.0], [-0.2, 0.0], [0.0, 0.9], 0.5)
@@ -70,6 +71,38 @@ def test_masses_of_springs(name):
     _, column, masses = drawn(rk.plot.scene(BLOCK, model=model, rotation=0.3))
     np.testing.assert_allclose(np.hypot(*masses.T) / BLOCK.half_diagonal, heights, atol=1e-12)
     np.testing.assert_allclose(np.arctan2(*column[-1]), 0.3)
+
+
+@pytest.mark.parametrize("rotation", [0.0, 0.1, -0.1])
+def test_a_frame_has_two_columns_under_its_beam(rotation):
+    """The beam lies on the corners of both columns, level, and moves twice as far as their centres."""
+    axis = rk.plot.scene(rk.Block.from_frame(0.6, 3.0, beam=4.0), rotation=rotation)
+    one, other, beam = (patch.get_xy()[:-1] for patch in axis.patches[-3:])
+    assert np.ptp(one[:, 1]) >= 3.0 - 1e-9
+    np.testing.assert_allclose(other - one, np.broadcast_to([4.2, 0.0], one.shape), atol=1e-12)
+    assert beam[:, 1].min() == pytest.approx(one[:, 1].max(), abs=1e-12)
+    alpha, size = np.arctan2(0.6, 3.0), np.hypot(0.6, 3.0) / 2
+    moved = size * (np.sin(alpha) - np.sin(alpha - abs(rotation)))  # of the centre
+    still = rk.plot.scene(rk.Block.from_frame(0.6, 3.0, beam=4.0)).patches[-1].get_xy()[0]
+    assert abs(beam[0, 0] - still[0]) == pytest.approx(2 * moved, abs=1e-9)
+
+
+def test_restraints_are_drawn():
+    """A tie is as much longer as the model says; a tendon is drawn through the base."""
+    block, rotation = rk.Block.from_dimensions(0.6, 3.0), 0.15
+    size = np.hypot(0.6, 3.0) / 2
+    model = rk.Housner() + rk.models.Tie(1.2, 1.0) + rk.models.Tendon(1.0) + rk.models.Damper(0.1)
+    drawn_lines = [
+        [
+            line.get_xydata()
+            for line in rk.plot.scene(block, model=model, rotation=turn).lines
+            if line.get_color() == RED
+        ]
+        for turn in (0.0, rotation)
+    ]
+    (still, *_), (open_, *_) = drawn_lines
+    longer = np.hypot(*np.ptp(open_, axis=0)) - np.hypot(*np.ptp(still, axis=0))
+    assert longer == pytest.approx(1.2 * size * np.sin(rotation), rel=0.05)  # the tie turns a little
 
 
 def test_a_column_bends():

@@ -383,6 +383,7 @@ def test_slopes_by_the_numbers_of_an_edge():
         np.testing.assert_allclose(bend, edge.at(opening) - edge.rise(opening), rtol=1e-14)
 
 
+@pytest.mark.slow
 def test_slopes_of_an_outcome_by_a_radius_of_many():
     """Compare slopes by radii of a block with different edges with differences."""
     angle, block = np.linspace(0.0, 0.5, 10), rk.blocks.AsymmetricBlock(0.25, 0.3, 2.5)

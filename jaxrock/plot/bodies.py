@@ -55,6 +55,8 @@ class Body(NamedTuple):
     def _symmetric(cls, block: Block | FlexibleBlock, model: AbstractEquation) -> "Body":
         alpha = float(block.alpha)
         radius = float(block.length) / 2 if isinstance(block, FlexibleBlock) else float(block.half_diagonal)
+        if isinstance(block, Block) and block.beam is not None:  # the column, which alone has a higher frequency
+            radius *= (1 + 2 * float(block.beam)) / (1 + 3 * float(block.beam))  # Makris & Vassiliou 2013
         b, h = radius * np.sin(alpha), radius * np.cos(alpha)
         side = np.linspace(0, 2 * h, 25)
         across = np.repeat(b, side.size)

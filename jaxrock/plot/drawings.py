@@ -18,6 +18,7 @@ from jaxrock.motions.motion import AbstractMotion
 from jaxrock.motions.pulses.pulse import AbstractPulse
 from jaxrock.plot.bodies import AnyBlock, Body, Shapes, turned
 from jaxrock.plot.responses import acceleration_of, moments_seen
+from jaxrock.plot.restrained import draw_frame, draw_restraints
 from jaxrock.plot.style import BLUE, GREY, RED, SAND, figure
 
 if TYPE_CHECKING:
@@ -44,14 +45,15 @@ def scene(
 
     Corner O is that of positive rotations; the ground's acceleration is positive to the right. A block defined by
     slenderness and frequency alone is drawn as the rectangle of that p. An asymmetric one is drawn as the parallelogram
-    with its corners and its centre of mass. What stands behind a wall that opens to one side is drawn hatched.
+    with its corners and its centre of mass. What stands behind a wall that opens to one side is drawn hatched. A frame
+    is drawn as two columns under its beam; tendons, ties and dampers are red.
 
     **Arguments:**
 
     - `block`: a `Block`, `AsymmetricBlock` or `FlexibleBlock` of scalars; `motion`: any motion; None leaves it out.
     - `axis`: matplotlib axis; None makes a figure.
     - `model`: as in `outcome`. A `Spring` adds its column, with the block behind it; a `Rolling` adds the block's
-      edges.
+      edges; restraints are added where they act.
     - `rotation`: rotation of the drawn block [rad], in [-pi/2, pi/2].
     - `bending`: displacement of the top of a flexible block by bending, in its first clamped mode [m].
 
@@ -76,12 +78,17 @@ def scene(
         column = bent * np.concatenate([[0.0], shape / shape[-1]])
     shapes = body.pose(rotation, column)
     draw_ground(axis, body, block.only_side if isinstance(block, Block) else None)
-    draw(axis, body, shapes)
+    outline, *_ = draw(axis, body, shapes)
+    beam = np.zeros((0, 2))
+    if isinstance(block, Block):
+        if block.beam is not None:
+            beam = draw_frame(axis, body, shapes, {"facecolor": outline.get_facecolor(), "edgecolor": "black"})
+        draw_restraints(axis, body, model, rotation, block)
     if isinstance(block, AsymmetricBlock):
         _sides(axis, body, rotation)
     else:
         _symbols(axis, body, rotation, isinstance(model, Spring) or isinstance(block, FlexibleBlock))
-    every = np.concatenate([shapes.outline, shapes.column, [body.right, body.left]])
+    every = np.concatenate([shapes.outline, shapes.column, [body.right, body.left], beam])
     room = 0.2 * body.size
     axis.set(xlim=(every[:, 0].min() - 1.6 * room, every[:, 0].max() + 1.6 * room))
     axis.set(ylim=(-1.35 * room, every[:, 1].max() + room), aspect="equal")
