@@ -73,7 +73,7 @@ class HarmonicMotion(AbstractPulse):
 
 
 def cycles_in(motion: AbstractMotion) -> Scalar | None:
-    """Return the number of cycles of all harmonic motions in a motion, without derivatives; None: there is none."""
+    """Return the number of cycles of all harmonic parts of a motion, without derivatives; None without such parts."""
 
     def is_harmonic(part):
         return isinstance(part, HarmonicMotion)

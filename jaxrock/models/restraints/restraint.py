@@ -56,7 +56,7 @@ class AbstractRestraint(Owner):
         return False
 
     def link(self, block: Block) -> Link | None:
-        """Return a link with a memory, besides the terms; None where there is none."""
+        """Return a link with a memory, which acts besides the terms; None for a restraint without memory."""
         return None
 
     def restrains(self, model: AbstractEquation) -> "Restrained":
