@@ -113,7 +113,7 @@ class SimulatedFragility(AbstractTable):
         **Arguments:**
 
         - `bound`: "lower" counts undecided scenes as standing, "upper" as toppled, "share" by their `share`. None is
-          allowed if there are none.
+          allowed where every scene is decided.
 
         **Raises:** ValueError if a bound is needed, or is another word.
         """

@@ -12,7 +12,7 @@ _WIDE = 4 * _NEAR  # distance from the state that stands for such states
 _EQUAL = 1e-6  # distance from its start at which an orbit comes back
 _LONGER = 10  # times the periods in which a state that stands for others settles
 _LONGEST = 64  # periods of an orbit that is found
-AWAY = 1e9  # where a state is said to be that there is none of
+AWAY = 1e9  # rotation and velocity that stand for a state that overturned or was not computed
 
 
 def orbits_of(states: np.ndarray, periods: int, images: Callable, eps: float) -> tuple[np.ndarray, list[np.ndarray]]:
@@ -22,7 +22,7 @@ def orbits_of(states: np.ndarray, periods: int, images: Callable, eps: float) ->
 
     - `states`: (n, 2), in units in which they are of order 1.
     - `periods`: after which they were found.
-    - `images`: returns the states after numbers of periods from states, `AWAY` where there are none.
+    - `images`: returns the states after numbers of periods from states, `AWAY` for a block that has no state then.
     - `eps`: rounding unit of the states.
 
     **Returns:** (n,) numbers, 0 of states that do not settle; (period, 2) states of each orbit.
